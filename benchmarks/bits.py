@@ -24,9 +24,9 @@ from rich.console import Console
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.problems import cut_cells, splash
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.operator_protocol import families
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.run.progress import ProgressLines
 from warp_lcp.scene.scene_file import load_scene

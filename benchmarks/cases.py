@@ -16,7 +16,7 @@ from warp_lcp.benchmarks.harness.machine import array_bytes, forget_peak, reside
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.benchmarks.problems import Splash, warm_changes
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 
 RTOL = 1e-6
 # A method without fallbacks may need hundreds of steps, and its residual may rise for more steps

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.contacts import SIMULATOR
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.contact_problem import ContactImpulses, ContactProblem
 from warp_lcp.scene.scene_file import load_scene

@@ -19,11 +19,11 @@ from warp_lcp.benchmarks.harness.record import (
     Results,
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.gallery.contact_scenes import SCENES, SETTLING, heavy_on_light
 from warp_lcp.gallery.contact_stepper import ContactStepper
 from warp_lcp.gallery.rigid_world import Assembly, World
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.rigid.contact_models import (
     BoxedModel,
     ContactModel,

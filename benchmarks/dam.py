@@ -18,7 +18,7 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.peers.petsc import environment, interpreter, missing
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.gallery import dam
 
 SIZES: Tables = {"width": 16.0, "high": 24.0, "low": 4.0}

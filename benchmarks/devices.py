@@ -19,7 +19,7 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results, shown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns
 from warp_lcp.benchmarks.problems import splash
-from warp_lcp.problem.solve_loop import Solver, Workspace
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.rigid.contact_models import BoxedModel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators

@@ -242,10 +242,10 @@ def emulate_decisions():
         setattr(wp.array, name, counting("calls", getattr(wp.array, name)))
 
 
-def arrays_of(value, kind, found):
+def arrays_of(value, kind, arrays):
     """Collect addresses, sizes and element types of the arrays in a kernel argument.
 
-    Arrays in structs and in tables of structs are included. `found` maps an address to bytes and
+    Arrays in structs and in tables of structs are included. `arrays` maps an address to bytes and
     type.
     """
     if isinstance(value, array_t):
@@ -260,14 +260,16 @@ def arrays_of(value, kind, found):
             if value.data and all(shape)
             else 0
         )
-        if size > found.get(value.data, (0, None))[0]:
-            found[value.data] = size, dtype
+        if size > arrays.get(value.data, (0, None))[0]:
+            arrays[value.data] = size, dtype
         if size and isinstance(dtype, codegen.Struct) and value.ndim == 1:
             for i in range(shape[0]):
-                arrays_of(dtype.ctype.from_address(value.data + i * value.strides[0]), dtype, found)
+                arrays_of(
+                    dtype.ctype.from_address(value.data + i * value.strides[0]), dtype, arrays
+                )
     elif isinstance(value, ctypes.Structure) and isinstance(kind, codegen.Struct):
         for name, var in kind.vars.items():
-            arrays_of(getattr(value, name), var.type, found)
+            arrays_of(getattr(value, name), var.type, arrays)
 
 
 def compared(invoke):
@@ -330,7 +332,7 @@ def checked_by_cells(invoke):
         arrays, (_, rows, kernel_args), columns, twin = (
             {},
             params,
-            form.declared.found,
+            form.declared.reductions,
             form.by_cells,
         )
         arrays_of(kernel_args, kernel.adj.args[1].type, arrays)

@@ -12,7 +12,7 @@ of steps are counted in another way (`benchmarks/gpu_launches.py`).
 from typing import TYPE_CHECKING
 
 from benchmarks import emulated_cuda  # must precede the package
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.kernel_variant import KernelVariant
 from warp_lcp.kernels.layout import BoundOperands
@@ -264,7 +264,7 @@ def count(name: str, one: BoundByName, kernel_args: Tables, folder: Path) -> Ins
     memory = EmulatedMemory((int(a.ptr), a.numpy().copy()) for a in arrays)
     blocks = -(-math.prod(dim) // BLOCK)
     constants = constants_of(parameters, BLOCK, blocks)
-    found = issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in chunk_range])
+    counts = issued(kernel.code, constants, memory, [(t % BLOCK, t // BLOCK) for t in chunk_range])
     planes, size = min(rows.slab, rows.planes), one.bound.rows.size
     ratio = max(one.bound.rows.other_size // size, 1) if size else 1
     finer = 8 if ratio > 4 else 1  # a thread takes an aggregate of the finer level
@@ -278,12 +278,12 @@ def count(name: str, one: BoundByName, kernel_args: Tables, folder: Path) -> Ins
     }
     moved = sum(
         size
-        for reached in (found.read, found.written)
+        for reached in (counts.read, counts.written)
         for begin, size in fields.items()
         if any(begin <= address < begin + size for address in reached)
     )
     return InstructionCount(
-        name, found, cells, planes, kernel.registers, moved / cell_count, kernel.spilled
+        name, counts, cells, planes, kernel.registers, moved / cell_count, kernel.spilled
     )
 
 

@@ -303,8 +303,11 @@ class KernelCheck:
         of_kind, stays = next(
             (what for known, what in UNORDERED.items() if fnmatchcase(name, known)), ("", None)
         )
-        for before, here, there in zip(*map(copies.views, blocks), strict=True):
-            written, kind = (bits(before) != bits(here)) | (bits(before) != bits(there)), here.dtype
+        for before, here, threads_result in zip(*map(copies.views, blocks), strict=True):
+            written, kind = (
+                (bits(before) != bits(here)) | (bits(before) != bits(threads_result)),
+                here.dtype,
+            )
             if not written.any():
                 continue
             allowed = ALLOWED.get(
@@ -315,17 +318,20 @@ class KernelCheck:
             if among(name, CANCEL):
                 size = max(largest(x) for x in copies.views(copies.before) if x.dtype == kind)
             if kind.kind == of_kind:
-                here, there = stays(here, threads), stays(there, threads)
+                here, threads_result = stays(here, threads), stays(threads_result, threads)
                 written, size = np.ones(len(here), dtype=bool), largest(here)
-            off = difference(here, there, size)
+            off = difference(here, threads_result, size)
             self.arrays += 1
             self.worst = max(self.worst, (off / (allowed or 1.0), name))
             if off > allowed:
-                count = np.count_nonzero(bits(here) != bits(there))
+                count = np.count_nonzero(bits(here) != bits(threads_result))
                 self.differs[name] = (
                     f"{name} is off by {off:.0e} in {count} of {written.sum()} {kind}"
                 )
-            if not difference(here, spoiled(there, written, allowed * size), size) > allowed:
+            if (
+                not difference(here, spoiled(threads_result, written, allowed * size), size)
+                > allowed
+            ):
                 self.unnoticed.add(name)
         return self.arrays > arrays
 
@@ -364,16 +370,16 @@ def largest(a):
     return float(a[a < ENDLESS].max(initial=0.0))
 
 
-def difference(here, there, size):
+def difference(here, other_result, size):
     """Return the largest difference, relative to the larger of size and number.
 
     For integers: whether any number differs.
     """
-    other = bits(here) != bits(there)
+    other = bits(here) != bits(other_result)
     if here.dtype.kind != "f":
         return float(other.any())
     with np.errstate(invalid="ignore", divide="ignore"):
-        a, b = here[other].astype(np.float64), there[other].astype(np.float64)
+        a, b = here[other].astype(np.float64), other_result[other].astype(np.float64)
         off = np.where(
             (a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b) / np.maximum(np.abs(a), size)
         )

@@ -67,7 +67,7 @@ class LaunchCounter:
         every = -(-threads // WARP)
         taken = min(WARPS, every)
         firsts = [every * (2 * i + 1) // (2 * taken) * WARP for i in range(taken)]
-        found = mean_of(
+        counts = mean_of(
             [
                 issued(
                     code.code,
@@ -83,15 +83,15 @@ class LaunchCounter:
             emulated_cuda.arrays_of(value, argument.type, arrays)
         moved = sum(
             size
-            for reached in (found.read, found.written)
+            for reached in (counts.read, counts.written)
             for begin, size in spans_of(arrays)
             if any(begin <= address < begin + size for address in reached)
         )
         return InstructionCount(
             key,
-            found,
+            counts,
             cells=cells / threads,
-            waits=found.waits,
+            waits=counts.waits,
             registers=code.registers,
             bytes=moved / max(cells, 1),
             spilled=code.spilled,

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from benchmarks import emulated_cuda, gpu_counts  # must precede the package
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.launch_graph import Launch
 from warp_lcp.kernels.layout import BoundOperands

@@ -15,7 +15,7 @@ import tracemalloc
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 SHAPES, REPEAT, SEED = ((1024, 1024), (128, 128, 128)), 9, 2027
 TOLERANCES = (1e-6, 1e-10)

@@ -23,7 +23,7 @@ from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTabl
 from warp_lcp.benchmarks.harness.timing import Figure, Options, in_turns, ratios
 from warp_lcp.benchmarks.kernel_peers import numba_products, plain_product
 from warp_lcp.benchmarks.problems import Splash, basin
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.kernels import Rows, StencilKernel
 from warp_lcp.kernels.layout import BoundOperands
 from warp_lcp.kernels.stencil_kernel import BoundKernel

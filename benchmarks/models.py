@@ -24,7 +24,7 @@ from warp_lcp.benchmarks.harness.machine import array_bytes, machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.report import markdown
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.run.stepping import plan_dt
 from warp_lcp.scene.models import TABLE

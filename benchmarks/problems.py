@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.gallery.fluid import (
     BOUNDS,
     SOLID_CENTER,

@@ -25,8 +25,8 @@ from warp_lcp.benchmarks.harness.timing import Options, ratios
 from warp_lcp.benchmarks.problems import BOUNDS, Splash, plane, splash
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import PoissonArguments
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.operator_protocol import HasStencil, has
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.subproblems.multigrid_workspace import MultigridWorkspace
 
 TITLE = "Published methods for the pressure LCP"

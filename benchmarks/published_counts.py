@@ -19,11 +19,11 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.book import appendix_c
 from warp_lcp.benchmarks.book import problems as book
 from warp_lcp.benchmarks.book.outcome import outcome
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.gallery import Problem, ball_obstacle, journal_bearing
 from warp_lcp.gallery.obstacle import membrane_height
 from warp_lcp.host_problem import Matrix
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 
 WITHIN = 2  # iterations by which a count may differ
 P4PDES, DEALII, PERMON, TAO, BOOK = (

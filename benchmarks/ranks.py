@@ -44,7 +44,7 @@ from warp_lcp.distributed.decomposition import Decomposition
 from warp_lcp.distributed.halo import Halo
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.kernels.thread_pool import VARIABLE
-from warp_lcp.problem.solve_loop import Workspace
+from warp_lcp.problem.method_protocol import Workspace
 from warp_lcp.run.devices import devices, free_memory
 
 TITLE = "Solves on several ranks"
@@ -346,10 +346,10 @@ def on_ranks(
     for turn in range(repeat + 1):
         if ranks.is_root:
             say(f"ranks: {ranks.size}, round {turn} of {repeat}")
-        for case, *others in cases:
+        for case, *results in cases:
             if turn:
                 case.sample(keep=True)
-            for plain, count in zip(others, (1, ranks.size), strict=True):
+            for plain, count in zip(results, (1, ranks.size), strict=True):
                 if plain is not None:
                     wl.set_threads(count)
                     plain.sample(keep=turn > 0)
@@ -357,7 +357,7 @@ def on_ranks(
             request = ranks.comm.Ibarrier()  # waits for the first rank
             while not request.Test():
                 time.sleep(PAUSE)
-    return [*records, *(case.record(*others) for case, *others in cases)]
+    return [*records, *(case.record(*results) for case, *results in cases)]
 
 
 def shared_cases(n: int, ranks: Ranks, device: str) -> list[RankScalingCase]:

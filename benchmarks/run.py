@@ -16,11 +16,11 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Bars, BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, timed
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.material.boundary import WholeCells
 from warp_lcp.material.particle_simulation import ParticleSimulation
-from warp_lcp.problem.solve_loop import Solver, Workspace
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.run.loop import RunRequest, run_scene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators

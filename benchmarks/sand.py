@@ -15,7 +15,7 @@ import warp_lcp as wl
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordLines, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.granular import SIMULATOR
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import SandSimulation

@@ -30,9 +30,9 @@ from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.peers.libraries import pyamg, scipy_cg
 from warp_lcp.benchmarks.peers.peer import PeerAnswer, PeerProblem
 from warp_lcp.benchmarks.problems import BOUNDS, anisotropic, cut_cells, splash
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.operators.grid_poisson import PoissonArguments
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.solvers.fallback import Progress
 
 TITLE = "Linear and LCP pressure solves"

@@ -21,7 +21,7 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Figure, Options, ratios
 from warp_lcp.benchmarks.sparse_family import FAMILY, SparseProblem, numbered_at_random
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 TITLE = "Sparse matrices numbered at random: with bounds, against PyAMG without"
 # Roots of the numbers of unknowns; first seed of problems on which nothing was tuned.

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import warp_lcp as wl
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 
 VISCOSITIES = (1e-3, 1.0, 1e3, 1e5)  # [Pa s]

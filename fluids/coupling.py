@@ -103,7 +103,7 @@ class BodyCoupling:
     def join(self, A: wl.GridPoisson) -> wl.SumOperator:
         """Return the operator A + rho dx^d U M^-1 U' of liquid and bodies.
 
-        `take` updates it in place.
+        `update` updates it in place.
         """
         self._low = wl.LowRankOperator.of_blocks(A, self.columns, self._weights())
         self._gathering.at_once = self.columns.comm is not None
@@ -203,7 +203,7 @@ class BodyCoupling:
     def _launch_gather(self, x: wp.array) -> None:
         self.columns.gather(x, launch=launch)
 
-    def hold(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
+    def move_buried(self, velocity: Sequence[wp.array], known: Sequence[wp.array]) -> None:
         """Move particles that a body has buried along with it; collective.
 
         Below a body that rests on a floor only gravity would act on them.

@@ -31,7 +31,7 @@ from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 
 CONSTANTS = {
@@ -117,16 +117,16 @@ class Projection:
         result: result of the solve; `result.x` is kick_dt p / (rho dx) [m/s]. None without liquid
             cells.
         unknowns: number of FLUID cells.
-        found: returns `released` and `max_outflow`, and waits for the device.
+        read_release: returns `released` and `max_outflow`, and waits for the device.
     """
 
     result: wl.SolveResult | None
     unknowns: int
-    found: Callable[[], tuple[float, float]]
+    read_release: Callable[[], tuple[float, float]]
 
     @functools.cached_property
     def _release_counts(self) -> tuple[float, float]:
-        return self.found()
+        return self.read_release()
 
     @property
     def released(self) -> int:

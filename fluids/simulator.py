@@ -237,7 +237,7 @@ class LiquidSimulation(ParticleSimulation):
             window, self.projection.known, self.projection.kind, self.projection.contact, dt
         )
         if self.projection.coupling is not None:
-            self.projection.coupling.hold(self.velocity, self.projection.known)
+            self.projection.coupling.move_buried(self.velocity, self.projection.known)
         self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.grid_to_particles(window, self.projection.kind, dt)
@@ -587,7 +587,9 @@ class LiquidSimulation(ParticleSimulation):
     def _held(self, projected: Projection) -> Projection:
         """Reset the velocities of the sources' faces, and show their cells as liquid."""
         if self.sources is not None:
-            self.sources.hold(self.velocity, self.projection.known, self.projection.cells)
+            self.sources.impose_velocity(
+                self.velocity, self.projection.known, self.projection.cells
+            )
         return projected
 
     def _explain(self, result: wl.SolveResult) -> NoReturn:

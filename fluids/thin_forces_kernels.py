@@ -77,24 +77,24 @@ def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
 @wp.func
 def connected(cube: DualCell):
     """Return the corners that edges without walls connect with corner 0, one bit each."""
-    found = int(1)
+    corners = int(1)
     for _pass in range(PASSES):
         for n in range(4 * cube.planes):
-            if (found >> n) & 1 != 0:
+            if (corners >> n) & 1 != 0:
                 for axis in range(cube.planes + 1):
                     if cube.distance[n, axis] == _OPEN:
-                        found = found | (1 << (n ^ (1 << axis)))
-    return found
+                        corners = corners | (1 << (n ^ (1 << axis)))
+    return corners
 
 
 @wp.func
-def open_length(cube: DualCell, found: int, first: int, axis: int):
+def open_length(cube: DualCell, corners: int, first: int, axis: int):
     """Return the length of an edge that belongs to the connected corners [cells]."""
     second = first ^ (1 << axis)
     length = float(0.0)
-    if (found >> first) & 1 != 0:
+    if (corners >> first) & 1 != 0:
         length = wp.where(cube.distance[first, axis] == _OPEN, 1.0, cube.distance[first, axis])
-    if (found >> second) & 1 != 0 and cube.distance[second, axis] != _OPEN:
+    if (corners >> second) & 1 != 0 and cube.distance[second, axis] != _OPEN:
         length += cube.distance[second, axis]
     return length
 
@@ -164,7 +164,7 @@ def open_area(
     S: WallKernelFields,
     cube: DualCell,
     at: wp.vec3i,
-    found: int,
+    corners: int,
     first: int,
     along: int,
     other: int,
@@ -188,7 +188,7 @@ def open_area(
                     corner = corner ^ (1 << ahead)
                     ahead = wp.where((n + m) & 1 != 0, along, other)
                     count += 1
-            if (found >> here) & 1 != 0:
+            if (corners >> here) & 1 != 0:
                 number = cube.number[here, back]
                 alike = number > 0 and number == cube.number[corner, ahead]
                 a = cube.distance[here, back]
@@ -200,13 +200,13 @@ def open_area(
                     area += corner_area(a, b, lean_a, lean(S, cube, at, here, ahead, back))
                 else:
                     area += arc_area(count, a, b, alike)
-    if walls == 0 and (found >> first) & 1 != 0:
+    if walls == 0 and (corners >> first) & 1 != 0:
         area = 1.0
     return area
 
 
 @wp.func
-def wall_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, axis: int):
+def wall_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corners: int, axis: int):
     """Return the component along an axis of the wall's vector area in the cube.
 
     The wall is the one around the connected corners; the vector points into it [cells, 3-D:
@@ -217,11 +217,11 @@ def wall_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, axi
     near = float(0.0)
     far = float(0.0)
     if cube.planes == 1:
-        near = open_length(cube, found, 0, along)
-        far = open_length(cube, found, 1 << axis, along)
+        near = open_length(cube, corners, 0, along)
+        far = open_length(cube, corners, 1 << axis, along)
     else:
-        near = open_area(S, cube, at, found, 0, along, (axis + 2) % 3)
-        far = open_area(S, cube, at, found, 1 << axis, along, (axis + 2) % 3)
+        near = open_area(S, cube, at, corners, 0, along, (axis + 2) % 3)
+        far = open_area(S, cube, at, corners, 1 << axis, along, (axis + 2) % 3)
     return float(cube.sides[axis]) * (near - far)
 
 
@@ -239,7 +239,7 @@ def is_bent(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis
 
 
 @wp.func
-def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, crossed: int):
+def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corners: int, crossed: int):
     """Return the vector area of the wall on an edge of corner 0, as a share, and its centroid.
 
     The centroid is a vector from the crossing [cells], 0 for plane walls.
@@ -254,7 +254,7 @@ def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, c
     first = cube.number[0, crossed]
     plane = bool(first > 0)
     for n in range(4 * cube.planes):
-        if (found >> n) & 1 != 0:
+        if (corners >> n) & 1 != 0:
             for axis in range(cube.planes + 1):
                 if cube.distance[n, axis] != _OPEN:
                     counts[axis] = counts[axis] + 1
@@ -262,7 +262,7 @@ def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, c
                         plane = False
     if plane:
         for n in range(4 * cube.planes):
-            if (found >> n) & 1 != 0:
+            if (corners >> n) & 1 != 0:
                 for axis in range(cube.planes + 1):
                     if is_bent(S, cube, at, n, axis, (axis + 1) % (cube.planes + 1)):
                         plane = False
@@ -271,7 +271,7 @@ def shared_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, found: int, c
     for axis in range(cube.planes + 1):
         if plane or axis == crossed or counts[axis] == 0:
             sharing = wp.where(plane or counts[axis] == 0, total, counts[axis])
-            area[axis] = wall_area(S, cube, at, found, axis) / float(sharing)
+            area[axis] = wall_area(S, cube, at, corners, axis) / float(sharing)
     centroid = wp.vec3()
     if not plane:
         for axis in range(cube.planes + 1):

@@ -219,12 +219,12 @@ def contact_kernel(
     x: F64,
     contact: U8,
     sums: F64,
-    found: wp.array(dtype=wp.float64),
+    reduced: wp.array(dtype=wp.float64),
 ):
     """Set the contact of wall cells; sum released cells, and find the largest |y|.
 
     The sums are those of a row: its cells that release liquid, and the largest |y| of its full
-    cells. If `found` is given, it gets the total and the maximum over all rows.
+    cells. If `reduced` is given, it gets the total and the maximum over all rows.
     """
     released = int(0)
     worst = wp.float64(0.0)
@@ -244,6 +244,6 @@ def contact_kernel(
             worst = wp.max(worst, wp.abs(y))
     sums[k, j, 0] = wp.float64(released)
     sums[k, j, 1] = worst
-    if found:
-        wp.atomic_add(found, 0, wp.float64(released))
-        wp.atomic_max(found, 1, worst)
+    if reduced:
+        wp.atomic_add(reduced, 0, wp.float64(released))
+        wp.atomic_max(reduced, 1, worst)

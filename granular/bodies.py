@@ -415,7 +415,7 @@ class SandBodies:
         sum_over_ranks(comm, self._total.flatten(), slice(None), launch, condition=self._in_contact)
         return self._each, self._total
 
-    def _parts(self, found: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
+    def _parts(self, faces: BodyFaces) -> tuple[np.ndarray, np.ndarray]:
         """Split the lists of cells and edges into runs, one per thread.
 
         Returns the first and last entry of both lists for each run, and the runs of each body.
@@ -425,7 +425,7 @@ class SandBodies:
         parts: list[list[int]] = []
         for body in range(len(self.numbers)):
             first = len(spans)
-            for column, owner in ((0, found.cell.body), (2, found.edge.body)):
+            for column, owner in ((0, faces.cell.body), (2, faces.edge.body)):
                 low, high = np.searchsorted(owner, [body, body + 1])
                 for start in range(low, high, grain):
                     run = [0, 0, 0, 0]

@@ -365,15 +365,15 @@ def most_kernel(k, j, first, end, base: I8, capacity: F32, density: F32, rows: F
 
 
 @list_kernel("granular.packing")
-def fold_kernel(i, rows: F64, found: wp.array(dtype=wp.float64)):
+def fold_kernel(i, rows: F64, reduced: wp.array(dtype=wp.float64)):
     """Sum the rows' counts, and find the largest of their fractions.
 
     Both are exact in any order.
     """
     k = i // rows.shape[2]
     j = i - k * rows.shape[2]
-    wp.atomic_add(found, 0, rows[0, k, j])
-    wp.atomic_max(found, 1, rows[1, k, j])
+    wp.atomic_add(reduced, 0, rows[0, k, j])
+    wp.atomic_max(reduced, 1, rows[1, k, j])
 
 
 @cell_kernel("granular.packing")

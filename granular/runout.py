@@ -47,7 +47,7 @@ def count_kernel(
 @forward_kernel(module="granular.runout")
 def select_kernel(
     counts: INTS,
-    found: WORDS,
+    selected: WORDS,
     rank: INTS,
     place: int,
     mask: wp.uint32,
@@ -60,7 +60,7 @@ def select_kernel(
     """
     axis = wp.tid()
     left = rank[axis]
-    bits = found[axis] & mask
+    bits = selected[axis] & mask
     if mask == wp.uint32(0):
         left = place
     chosen = int(-1)
@@ -73,7 +73,7 @@ def select_kernel(
             else:
                 left -= count
     bits = bits | (wp.uint32(wp.max(chosen, 0)) << shift)
-    found[axis] = bits
+    selected[axis] = bits
     rank[axis] = left
     out[axis] = wp.cast(wp.where(bits < SIGN, ~bits, bits ^ SIGN), wp.float32)
 

@@ -42,7 +42,7 @@ from warp_lcp.material.particle_log import Row
 from warp_lcp.material.particle_simulation import ParticleSimulation, ParticleSimulationOptions
 from warp_lcp.material.velocity_extrapolation import LayerCallback, extend_velocity
 from warp_lcp.operators.grid_poisson import FLUID
-from warp_lcp.problem.solve_loop import Solver, Workspace
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
 from warp_lcp.scene.scene import Scene
@@ -227,7 +227,7 @@ class SandSimulation(ParticleSimulation):
             self.stress.roll_back()
             raise
         if self.sources is not None:
-            self.sources.hold(self.velocity, [], self.packing.kind)
+            self.sources.impose_velocity(self.velocity, [], self.packing.kind)
         self.grid_to_particles(window, self.packing.kind, dt)
         below, most = self._mass_below(), self._largest_fraction()
         row = self.move(dt, window, self.density) | self._measured()
@@ -436,7 +436,7 @@ class SandSimulation(ParticleSimulation):
             solids.begin_step(self.time, dt)
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
-                self.sources.hold(solids.velocity, [])
+                self.sources.impose_velocity(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
             self._begin_bodies()
         if (
@@ -522,7 +522,7 @@ class SandSimulation(ParticleSimulation):
         self.bodies.bodies.apply_impulses(self.carried.impulses())
         self.solids.begin_step(self.time, dt)
         if self.sources is not None:
-            self.sources.hold(self.solids.velocity, [])
+            self.sources.impose_velocity(self.solids.velocity, [])
 
     def _launch_density(self, window: Window) -> None:
         self._find_density(window)

@@ -157,7 +157,7 @@ def keep_step_kernel(
 
 
 @forward_kernel(module="granular.momentum")
-def period_kernel(found: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.float64)):
+def period_kernel(step_sums: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.float64)):
     """Combine the sums of a period over cells, walls and ranks; a thread per column.
 
     `momentum_kernel` expects one set of sums per step. It adds roots of columns 6 and 7, and takes
@@ -166,7 +166,7 @@ def period_kernel(found: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.
     c = wp.tid()
     value = wp.float64(0.0)
     for step in range(PERIOD):
-        part = found[step, c] + found[step, COLUMNS + c]
+        part = step_sums[step, c] + step_sums[step, COLUMNS + c]
         if c >= 6:
             part = wp.sqrt(part)
         value += part

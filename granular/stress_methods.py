@@ -26,7 +26,7 @@ from warp_lcp.granular.stress_kernels import (
 from warp_lcp.granular.stress_layout import CONSTANTS
 from warp_lcp.kernels import KernelFile, Rows, StencilKernel
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.solve_loop import WorkspaceDefaults
+from warp_lcp.problem.method_protocol import WorkspaceDefaults
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import (
     Count,

@@ -33,9 +33,10 @@ from warp_lcp.operators import (
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.frictional_contact import FrictionalContact
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, Step
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import Precision, Step, VariationalInequality
+from warp_lcp.problem.solve_loop import VariationalInequality
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.problem.workspace_cache import release_workspace
 from warp_lcp.recommend import Budget, Recommendation, recommend

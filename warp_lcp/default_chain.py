@@ -12,8 +12,8 @@ from warp_lcp.operators.banded_matrix import NARROW
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.operator_protocol import HasLowRankTerm, HasRows, HasScale, HasStencil, has
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import Count, Settings
 from warp_lcp.solvers.assembled_matrix import AssembledMatrix

@@ -17,9 +17,9 @@ from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.data_types import BoundValues, OperatorLike, SupportsMatmul
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import Solver, Workspace
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.settings import CountOrZero, NonNegative, ShareOrZero, checked
 from warp_lcp.solvers.registry import method_of

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 
 from warp_lcp.operators.matrix_conversion import Form, as_dense, as_grid, as_sparse
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem_properties import ProblemProperties
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.registry import METHODS

@@ -14,10 +14,11 @@ from warp_lcp.kernels.fields import Array
 from warp_lcp.method_rules import Attempt, method_for, steps_allowed
 from warp_lcp.operators.matrix_conversion import RestatedProblem, renumbered
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.problem.operator_protocol import declared
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import Record, SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import Solver, VariationalInequality, Workspace
+from warp_lcp.problem.solve_loop import VariationalInequality
 from warp_lcp.problem.solve_loop import solve as solve_by
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria, check_criteria
 from warp_lcp.recommend import Recommendation, criteria, recommend

@@ -11,7 +11,8 @@ from typing import Literal
 from warp_lcp.default_chain import default_chain
 from warp_lcp.method_rules import LONGEST, Attempt, Rule, method_for, rules_for, steps_allowed
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve_loop import Solver, solve
+from warp_lcp.problem.method_protocol import Solver
+from warp_lcp.problem.solve_loop import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.problem_properties import TRIAL, ProblemProperties
 from warp_lcp.settings import Count, Positive, Settings, Share, checked

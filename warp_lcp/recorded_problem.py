@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from warp_lcp.files import Tables
 from warp_lcp.files.archive import Archive
 from warp_lcp.files.size_limits import check_claim
-from warp_lcp.files.tables import Tables
 from warp_lcp.host_problem import Problem
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_poisson import AXES, FLUID, GridPoisson

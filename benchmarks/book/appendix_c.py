@@ -24,7 +24,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, splash
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 
 # The book's methods: monotone searches without fallbacks, no preceding cycles, linear systems
 # solved. Num4LCP's default at kinks, "random", leaves their rows of the Jacobian empty, as "zero"

@@ -22,7 +22,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import contact_scenes
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.rigid.contact_models import BoxedModel, ContactSystem
 
 # Scenes in place of figure 2.3, whose scenes are dense and structured: brick walls.

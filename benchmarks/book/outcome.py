@@ -15,7 +15,7 @@ from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure
 from warp_lcp.gallery import Problem
 from warp_lcp.kernels.fields import Array
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 
 RTOL = 1e-6  # relative natural residual at which this library calls a problem solved
 DEEP = 1e-12  # tolerance of the solves, small enough to show the final convergence rate

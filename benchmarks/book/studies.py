@@ -31,7 +31,7 @@ from warp_lcp.benchmarks.harness.record import (
 )
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.gallery import Problem, contact, splash
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 
 STEPS = 10  # steps that figure C.5 times
 # Fewest unknowns for fitted exponents on grids: below, launches cost as much as the work.

@@ -22,8 +22,8 @@ from warp_lcp.benchmarks.extremes.case import (
     stopped,
 )
 from warp_lcp.benchmarks.extremes.problem import GridFields, GridProblem, with_solution
-from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, chance, given, noise, pool
-from warp_lcp.files.tables import Tables
+from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, chance, noise, pool, solve_cases
+from warp_lcp.files import Tables
 
 SHAPE = (40, 44)
 EXACT_OR_FLOOR = ExpectedOutcome(OutcomeKind.EITHER, frozenset({"FLOOR"}))
@@ -70,7 +70,7 @@ def given_pool(
 
     `more` holds arguments of SolveCase.
     """
-    return given(family, name, partial(pool, SHAPE, **fields), **(more or {}))
+    return solve_cases(family, name, partial(pool, SHAPE, **fields), **(more or {}))
 
 
 def degenerate() -> Iterator[ExtremeCase]:
@@ -81,8 +81,10 @@ def degenerate() -> Iterator[ExtremeCase]:
     family = "active sets"
     case = partial(given_pool, family)
     for share in (0.1, 0.5, 0.9):
-        yield from given(family, f"x = y = 0 on {share:.0%} of the cells", partial(planted, share))
-    yield from given(family, "x = y = 0 on all cells but one", lambda: planted(1.0))
+        yield from solve_cases(
+            family, f"x = y = 0 on {share:.0%} of the cells", partial(planted, share)
+        )
+    yield from solve_cases(family, "x = y = 0 on all cells but one", lambda: planted(1.0))
     yield from case("all active", b=np.abs(NOISE) + 0.01, lower=0.0)
     yield from case("all active but one", b=but((11, 12), -2.0, np.ones(SHAPE)), lower=0.0)
     yield from case("none active", b=-np.abs(NOISE) - 0.01, lower=0.0)
@@ -98,7 +100,7 @@ def degenerate() -> Iterator[ExtremeCase]:
     yield from case("lower bounds of noise, l > 0", lower=np.abs(noise(SHAPE, 13)))
     yield from case("upper bounds only", lower=-np.inf, upper=0.0)
     yield from case("checkerboard of bounds", lower=np.where(ODD, -np.inf, 0.0))
-    yield from given(family, "resting under a ceiling", ceiling)
+    yield from solve_cases(family, "resting under a ceiling", ceiling)
     for far in (1e6, 1e20, -1e20):
         yield from case(f"start at {far:g}", {"x0": np.full(SHAPE, far)})
 
@@ -135,7 +137,7 @@ def tolerances() -> Iterator[ExtremeCase]:
 
     The solve must end as FLOOR, not as CONVERGED, and must not loop for ever.
     """
-    case = partial(given, "tolerances")
+    case = partial(solve_cases, "tolerances")
     for rtol in (1e-15, 1e-17, 0.0):
         expected, stopping = (
             BELOW_ROUNDING if rtol < 1e-16 else EXACT_OR_FLOOR,

@@ -18,7 +18,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.problem import Problem
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 
 PRECISIONS = ("single", "mixed", "double")
 RTOL = {"single": 1e-3, "mixed": 1e-8, "double": 1e-8}

@@ -10,8 +10,17 @@ import numpy as np
 
 from warp_lcp.benchmarks.extremes.case import EITHER, SOLVED, ExtremeCase
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of
-from warp_lcp.benchmarks.extremes.shapes import AIR, FLUID, SOLID, chance, full, given, noise, pool
-from warp_lcp.files.tables import Tables
+from warp_lcp.benchmarks.extremes.shapes import (
+    AIR,
+    FLUID,
+    SOLID,
+    chance,
+    full,
+    noise,
+    pool,
+    solve_cases,
+)
+from warp_lcp.files import Tables
 
 SHAPES = ((48, 53), (17, 18, 19))
 Y, X = np.indices((48, 50))
@@ -33,7 +42,7 @@ def may_stop(value: float, largest: float) -> Tables:
 
 def slivers() -> Iterator[ExtremeCase]:
     """Yield cut cells whose open fractions go down to 1e-12 and below."""
-    case = partial(given, "cut fractions", promises=SINGLE_MAY_STOP)
+    case = partial(solve_cases, "cut fractions", promises=SINGLE_MAY_STOP)
     for shape in SHAPES:
         for smallest in (1e-3, 1e-6, 1e-12, 1e-30):
             yield from case(
@@ -113,7 +122,7 @@ def contrasts() -> Iterator[ExtremeCase]:
 
     The cells are up to a thousand times flatter than wide.
     """
-    case = partial(given, "contrasts")
+    case = partial(solve_cases, "contrasts")
     for ratio in (1e2, 1e4, 1e6, 1e8):
         for name, light in (
             ("layers", (Y // 6) % 2 == 1),
@@ -174,7 +183,7 @@ def bodies() -> Iterator[ExtremeCase]:
 
     Their masses are 10^-8 to 10^8 of the liquid's.
     """
-    case = partial(given, "rigid bodies")
+    case = partial(solve_cases, "rigid bodies")
     for inverse in (1e-8, 1e-4, 1.0, 1e4, 1e8):
         yield from case(
             f"one body, 1/mass = {inverse:g}",

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.sparse
 from scipy.optimize import linear_sum_assignment
 
-from warp_lcp.files.tables import TableView
+from warp_lcp.files import TableView
 
 AIR, FLUID, SOLID = 0, 1, 2
 AXES = "xyz"

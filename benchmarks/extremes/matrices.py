@@ -14,7 +14,7 @@ import scipy.sparse
 
 from warp_lcp.benchmarks.extremes.case import EITHER, INFEASIBLE, SOLVED, ExtremeCase
 from warp_lcp.benchmarks.extremes.problem import MatrixProblem
-from warp_lcp.benchmarks.extremes.shapes import chance, given
+from warp_lcp.benchmarks.extremes.shapes import chance, solve_cases
 from warp_lcp.gallery.matrices import semidefinite, skewed, spectrum_matrix
 
 N = 24
@@ -24,7 +24,7 @@ MAY_STOP = {"single": EITHER}
 
 def singular() -> Iterator[ExtremeCase]:
     """Yield singular symmetric positive semi-definite matrices, and tiny matrices."""
-    case = partial(given, "zero eigenvalues")
+    case = partial(solve_cases, "zero eigenvalues")
     for rank in (1, N // 2, N - 1):
         make_problem = partial(MatrixProblem.of, semidefinite(N, zeros=1 - rank / N))
         methods, expected = (
@@ -107,7 +107,7 @@ def cycling() -> Iterator[ExtremeCase]:
 
     The Newton method is that of the minimum map.
     """
-    case = partial(given, "P-matrices")
+    case = partial(solve_cases, "P-matrices")
     robust = (*NEWTON, "fischer-newton", *LEMKE)
     for n in (3, 4, 5, 6, 7, 9, 12, 30):
         yield from case(f"cyclic, {n} unknowns", partial(circulant, n), robust)

@@ -17,7 +17,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.exact import ExactEquations, stencil
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 from warp_lcp.host_problem import Matrix
 
 BALANCED = 1e-10  # share of sum |b|: a sum of b below it is 0 up to rounding
@@ -159,9 +159,9 @@ def faces_of(shape: tuple[int, ...], value: Callable[[tuple[int, ...]], np.ndarr
 
 def with_solution(cells: np.ndarray, x: np.ndarray, y: np.ndarray) -> GridProblem:
     """Return a problem with p >= 0 and solution x on FLUID cells, A x + b = y."""
-    made, inside = GridProblem(cells=cells, b=np.zeros(cells.shape)), cells == wl.FLUID
-    made.b[inside] = y[inside] - made.exact().matrix @ x[inside]
-    return made
+    problem, inside = GridProblem(cells=cells, b=np.zeros(cells.shape)), cells == wl.FLUID
+    problem.b[inside] = y[inside] - problem.exact().matrix @ x[inside]
+    return problem
 
 
 @dataclass(frozen=True)

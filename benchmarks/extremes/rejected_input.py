@@ -14,7 +14,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import ExtremeCase, RefusalCase
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 
 SHAPE = (4, 5)
 CELLS = np.array([[1] * 5] * 3 + [[0] * 5])

@@ -18,7 +18,7 @@ from warp_lcp.benchmarks.extremes.case import (
     SolveCase,
 )
 from warp_lcp.benchmarks.extremes.problem import GridFields, GridProblem, Problem, solvable
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 
 AIR, FLUID, SOLID = wl.AIR, wl.FLUID, wl.SOLID
 SEED = 7919
@@ -26,7 +26,7 @@ METHODS = ("projected-multigrid", "minimum-map-newton")  # methods that must sol
 LARGE_BUDGET = 60.0  # seconds for 10^6 unknowns
 
 
-def given(
+def solve_cases(
     family: str,
     name: str,
     make: Callable[[], Problem],
@@ -79,7 +79,7 @@ def grounded(shape: tuple[int, ...]) -> GridProblem:
 
 def sizes() -> Iterator[ExtremeCase]:
     """Yield grids of one cell, one layer, prime sizes, 10^6 cells and long ones."""
-    case = partial(given, "sizes")
+    case = partial(solve_cases, "sizes")
     for shape in (
         (1, 1),
         (1, 1, 1),
@@ -123,7 +123,7 @@ def sponge(shape: tuple[int, ...], liquid: float) -> GridProblem:
 
 def masks() -> Iterator[ExtremeCase]:
     """Yield grids of few or no unknowns, checkerboards, needles and walls of one cell."""
-    case = partial(given, "masks")
+    case = partial(solve_cases, "masks")
     for name, kind in (("solid", SOLID), ("air", AIR)):
         yield RefusalCase("masks", f"all {name}", partial(without_unknowns, kind), "A ")
     for name, around in (("air", AIR), ("solid", SOLID)):
@@ -224,7 +224,7 @@ def closed_pools() -> Iterator[ExtremeCase]:
 
     b of sum 0 is solvable; other b only if a bound separates.
     """
-    case = partial(given, "closed pools")
+    case = partial(solve_cases, "closed pools")
     for shape in ((48, 53), (17, 18, 19)):
         yield from case(f"compatible, {len(shape)}-D", partial(full, shape, lower=-np.inf))
         for flow, b in (("outflow", noise(shape) + 0.1), ("inflow", noise(shape) - 0.1)):

@@ -25,12 +25,12 @@ from warp_lcp.benchmarks.extremes.case import (
     stopped,
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem
-from warp_lcp.files.tables import Tables, TableValue, TableView
+from warp_lcp.files import Tables, TableValue, TableView
 from warp_lcp.fluids import SIMULATOR as FLUIDS
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.granular import SIMULATOR as GRANULAR
 from warp_lcp.granular.simulator import SandSimulation
-from warp_lcp.grid.particles import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.scene.simulator import Simulator
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
@@ -167,7 +167,9 @@ def box(low: Sequence[float], high: Sequence[float], **more: object) -> Tables:
     return {"shape": "box", "min": low, "max": high, **more}
 
 
-def made(kind: ExtremeMaterial, **tables: TableValue) -> Callable[[str, str], ParticleSimulation]:
+def simulation_maker(
+    kind: ExtremeMaterial, **tables: TableValue
+) -> Callable[[str, str], ParticleSimulation]:
     """Return a function that makes a small column.
 
     The scene's tables may be overridden. `velocity` is that of the column.
@@ -212,7 +214,11 @@ def steps_and_forces() -> Iterator[ExtremeCase]:
             **more: TableValue,
         ) -> RunCase:
             return RunCase(
-                kind.name, name, made(kind, **(tables or {})), precisions=kind.precisions, **more
+                kind.name,
+                name,
+                simulation_maker(kind, **(tables or {})),
+                precisions=kind.precisions,
+                **more,
             )
 
         for dt in (1e-9, 1e-6, 1e-3, 0.1, 1.0, 10.0):
@@ -234,18 +240,18 @@ def steps_and_forces() -> Iterator[ExtremeCase]:
             yield case(f"dt = {bad}", dt=bad, expected=ended_with("dt ="))
         still = at_rest if kind is liquid else all_but_at_rest
         yield case("at rest without gravity", tables=gravity(0.0, 0.0), dt=0.1, check=still)
-    all_open = made(
+    all_open = simulation_maker(
         liquid, domain={"open": ["left", "right", "top", "bottom"]}, velocity=[9.0, 0.0]
     )
     yield RunCase("liquid", "all sides open", all_open, leaves=True)
     whole = [box([0, 0], [1, 0.5], velocity=[3, 1])]
-    yield RunCase("liquid", "full and closed", made(liquid, liquid=whole))
+    yield RunCase("liquid", "full and closed", simulation_maker(liquid, liquid=whole))
     yield RunCase(
         "liquid",
         "free-slip, full and closed",
-        made(liquid, domain={"wall": "free-slip"}, liquid=whole),
+        simulation_maker(liquid, domain={"wall": "free-slip"}, liquid=whole),
     )
-    flat = made(
+    flat = simulation_maker(
         liquid,
         domain={"size": [2.0, 0.0625], "resolution": 64},
         liquid=[box([0.0, 0.0], [0.5, 0.03])],
@@ -253,7 +259,9 @@ def steps_and_forces() -> Iterator[ExtremeCase]:
     yield RunCase("liquid", "flat domain, 2 x 0.0625 m", flat)
     for density in (1e-6, 1e9):
         yield RunCase(
-            "liquid", f"density of {density:g} kg/m^3", made(liquid, physics={"density": density})
+            "liquid",
+            f"density of {density:g} kg/m^3",
+            simulation_maker(liquid, physics={"density": density}),
         )
 
 
@@ -272,7 +280,7 @@ def solids_and_depth() -> Iterator[ExtremeCase]:
         box([0.0, 0.0, 0.0], [0.25, 0.3, 0.25]),
         {"domain": {"size": [0.5, 0.5, 0.25], "resolution": 12}},
     )
-    deep = partial(made, liquid, **size, liquid=[column])
+    deep = partial(simulation_maker, liquid, **size, liquid=[column])
     for dt in (1e-9, 0.1, 10.0):
         yield case(f"3-D, dt = {dt:g} s", deep(), dt=dt)
     yield case("3-D, gravity of 1e6 m/s^2", deep(**gravity(0.0, -1e6, 0.0)))
@@ -281,17 +289,20 @@ def solids_and_depth() -> Iterator[ExtremeCase]:
         body = box([0.2, 0.14], [0.4, 0.3], density=1000.0 * ratio)
         yield case(
             f"a body of {ratio:g} of its density",
-            made(liquid, solid=[body], liquid=pond),
+            simulation_maker(liquid, solid=[body], liquid=pond),
             check=bodies_inside,
         )
     for speed in (1e-6, 1.0, 1e3):
         paddle = box(
             [0.05, -0.1], [0.15, 0.6], motion={"kind": "translation", "velocity": [speed, 0.0]}
         )
-        yield case(f"a paddle of {speed:g} m/s", made(liquid, solid=[paddle], liquid=pond))
+        yield case(
+            f"a paddle of {speed:g} m/s", simulation_maker(liquid, solid=[paddle], liquid=pond)
+        )
     gap = [box([0.1, -0.1], [0.4, 0.35]), box([0.402, -0.1], [0.9, 0.35])]
     yield case(
-        "between solids 2 mm apart", made(liquid, solid=gap, liquid=[box([0.0, 0.0], [1.0, 0.45])])
+        "between solids 2 mm apart",
+        simulation_maker(liquid, solid=gap, liquid=[box([0.0, 0.0], [1.0, 0.45])]),
     )
 
 
@@ -325,7 +336,7 @@ def particles_anywhere() -> Iterator[ExtremeCase]:
     for kind in (liquid, sand):
         name, case = (
             kind.name,
-            partial(RunCase, "particles", make=made(kind), precisions=kind.precisions),
+            partial(RunCase, "particles", make=simulation_maker(kind), precisions=kind.precisions),
         )
         yield case(f"{name} on nodes", prepare=on_nodes)
         yield case(f"{name} on walls and in corners", prepare=on_walls)
@@ -357,8 +368,9 @@ def particles_anywhere() -> Iterator[ExtremeCase]:
             )
         yield case(f"{CROWD:.0e} of {name} in one cell", prepare=crowd(CROWD), steps=2)
     more = {"prepare": crowd(CROWDED), "steps": 1, "budget": 90.0, "precisions": ("mixed",)}
-    yield RunCase("particles", f"{CROWDED:.0e} of liquid in one cell", made(liquid), **more)  # type: ignore[arg-type]
-    weightless = made(liquid, **gravity(0.0, 0.0))
+    crowded = simulation_maker(liquid)
+    yield RunCase("particles", f"{CROWDED:.0e} of liquid in one cell", crowded, **more)  # type: ignore[arg-type]
+    weightless = simulation_maker(liquid, **gravity(0.0, 0.0))
     yield RunCase(
         "particles",
         "10^6 in a cell that flies",

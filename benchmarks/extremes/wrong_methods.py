@@ -12,9 +12,9 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import ExpectedOutcome, ExtremeCase, OutcomeKind, SolveCase
 from warp_lcp.benchmarks.extremes.shapes import grounded, pool
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.problem.solve_loop import Solver, Workspace
+from warp_lcp.problem.method_protocol import Solver, Workspace
 
 CAUGHT = ExpectedOutcome(OutcomeKind.CAUGHT)
 RIGHT = (  # problems that the correct methods solve

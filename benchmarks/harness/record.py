@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from warp_lcp.benchmarks.harness.timing import Figure
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 SOURCE = "source digest"  # fact of the machine's record: the version of the measured code
 MACHINE = "machine"  # name of the record of the machine and the date

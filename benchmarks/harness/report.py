@@ -22,7 +22,7 @@ from warp_lcp.benchmarks.harness.record import (
     Results,
     write_json,
 )
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 LIMIT = 60.0  # [s] limit of CPU time for a solve without max_seconds
 GRACE = 15.0  # [s] from the limit until the worker is ended

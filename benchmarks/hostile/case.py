@@ -16,7 +16,7 @@ import scipy.sparse
 from scipy.sparse.linalg import LinearOperator
 
 import warp_lcp as wl
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 from warp_lcp.host_problem import Matrix
 from warp_lcp.problem.affine_bounds import AffineBounds
 from warp_lcp.problem.operator_protocol import families

@@ -19,7 +19,7 @@ from warp_lcp.benchmarks.hostile.case import (
     HostileProgram,
     box_case,
 )
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 
 if TYPE_CHECKING:
     import qpsolvers

@@ -16,7 +16,7 @@ import numpy as np
 
 from warp_lcp.benchmarks.peers.peer import INEQUALITIES, Peer, PeerAnswer, PeerFailed, PeerProblem
 from warp_lcp.benchmarks.problems import BOUNDS
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 
 VARIABLE = "WARP_LCP_PETSC_PYTHON"  # environment variable that names the interpreter
 PROBE_SECONDS = 120.0

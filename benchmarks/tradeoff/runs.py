@@ -11,7 +11,7 @@ from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options
 from warp_lcp.benchmarks.tradeoff.settings import REFERENCE, TradeoffSetting
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.run.trial import BIN, Trial, trial
 from warp_lcp.scene.presets import changed, price_table
 from warp_lcp.scene.scene import Scene

@@ -17,8 +17,8 @@ from warp_lcp.benchmarks.extremes.exact import ExactEquations
 from warp_lcp.benchmarks.harness.machine import array_bytes
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord
 from warp_lcp.benchmarks.harness.timing import Figure, Options, clock
-from warp_lcp.files.tables import Tables, TableValue
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.files import Tables, TableValue
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.recorded_problem import RecordedProblem, files, load
 from warp_lcp.run.problem_folder import ProblemFolder
 from warp_lcp.run.stepping import plan_dt

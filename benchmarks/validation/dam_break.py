@@ -32,7 +32,7 @@ from warp_lcp.benchmarks.validation.signals import (
     stays,
     surface_height,
 )
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 from warp_lcp.fluids import LiquidSimulation
 
 RESOLUTIONS = (12, 24)  # cells of the column's base a

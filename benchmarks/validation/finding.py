@@ -163,13 +163,13 @@ def check_at(
 
     def decorated(run: Callable[..., None]) -> Callable[..., ValidationTrial]:
         @wraps(run)
-        def trial(*given: object, **named: object) -> ValidationTrial:
-            arguments = signature(run).bind(None, *given, **named)
+        def trial(*args: object, **named: object) -> ValidationTrial:
+            arguments = signature(run).bind(None, *args, **named)
             arguments.apply_defaults()
             return attempt(
                 check,
                 resolution.format(**arguments.arguments),
-                lambda found: run(found, *given, **named),
+                lambda finding: run(finding, *args, **named),
             )
 
         return trial

@@ -23,7 +23,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
 )
 from warp_lcp.benchmarks.validation.transfers import angular_momentum
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.granular.simulator import SandSimulation

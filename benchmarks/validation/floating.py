@@ -18,7 +18,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     create_liquid,
     steps,
 )
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.fluids import LiquidSimulation
 from warp_lcp.grid.staggered import Window
 

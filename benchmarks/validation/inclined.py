@@ -33,7 +33,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
     tilted,
 )
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.granular.materials import MATERIALS
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.granular.wall_friction import SandSolids

@@ -36,7 +36,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     tilted,
 )
 from warp_lcp.benchmarks.validation.signals import enclosed_cells, mode, period
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 
 RESOLUTIONS = (20, 40)  # cells along a side
 SIDE, LEVEL = 0.8, 0.4  # [m] side of the domain, and level of a pool

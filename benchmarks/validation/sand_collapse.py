@@ -29,7 +29,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     share_solved,
     steps,
 )
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
 
 # Aspect ratios by the number of cells of a column's width.

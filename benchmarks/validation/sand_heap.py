@@ -23,7 +23,7 @@ from warp_lcp.benchmarks.validation.finding import (
     plot,
 )
 from warp_lcp.benchmarks.validation.scenes import box, create_sand, positions, share_solved, steps
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
 
 ANGLES = (20.0, 30.0, 40.0)  # degrees, at which a layer stops

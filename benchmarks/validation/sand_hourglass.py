@@ -33,7 +33,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     share_solved,
     steps,
 )
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 
 OPENINGS = {1: (8, 12, 16), 2: (16,)}  # cells of the slot, by refinement
 # [m] Bin, initial sand, and the room below.

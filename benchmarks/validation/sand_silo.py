@@ -23,7 +23,7 @@ import warp as wp
 
 from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension

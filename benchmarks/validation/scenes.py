@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.fluids import FluidsSimulator, LiquidScene, LiquidSimulation
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.simulator import GranularSimulator, SandSimulation

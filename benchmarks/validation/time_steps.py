@@ -21,7 +21,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     create_liquid,
     create_sand,
 )
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 from warp_lcp.fluids.simulator import LiquidSimulation
 from warp_lcp.granular.simulator import SandSimulation
 from warp_lcp.operators.grid_poisson import FLUID

@@ -24,7 +24,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     steps,
     velocities,
 )
-from warp_lcp.files.tables import TableValue
+from warp_lcp.files import TableValue
 from warp_lcp.fluids import LiquidSimulation
 
 DURATION = 0.25  # [s]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import warp_lcp as wl
 from warp_lcp.benchmarks.extremes.case import HONEST, PRECISIONS, SolveCase, judge
 from warp_lcp.benchmarks.extremes.problem import GridProblem, MatrixProblem
-from warp_lcp.benchmarks.extremes.simulations import RunCase, liquid, made, sand
+from warp_lcp.benchmarks.extremes.simulations import RunCase, liquid, sand, simulation_maker
 
 METHODS = ("projected-multigrid", "minimum-map-newton")
 TAME = 2  # decades of coefficients that every precision except single must solve
@@ -165,6 +165,6 @@ def test_fuzzed_simulations(
         "particles": {"transfer": transfer},
     }
     verdict = judge(
-        RunCase("fuzzed", "run", made(kind, **tables), dt=dt, steps=3), precision, "cpu"
+        RunCase("fuzzed", "run", simulation_maker(kind, **tables), dt=dt, steps=3), precision, "cpu"
     )
     assert verdict.wrong == []

@@ -364,7 +364,7 @@ def legs(ranks):
         for streams, threads in ((True, 1), (False, 1), (True, 2)):
             wl.set_threads(threads)
             hierarchy = make_hierarchy(A.stencil, wp.float64, bounded=True)
-            hierarchy.hold(
+            hierarchy.mask_diagonal(
                 A.stencil.d, A.layout.load(part(free, boxes.box, shape).astype(np.uint8), wp.uint8)
             )
             hierarchy.rebuild_changed()

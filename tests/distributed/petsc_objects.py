@@ -54,7 +54,7 @@ def products():
         grid, shape = PetscGrid(lcp.A, real=dtype), problem.cells.shape
         free = problem.fluid & (np.random.default_rng(517).random(shape) < 0.8)
         held = grid.vector()
-        grid.hold(
+        grid.set_free_set(
             lcp.A.layout.load(
                 free.reshape(boxes.counts[::-1])[boxes.box.slices].reshape(lcp.A.shape), wp.uint8
             )
@@ -124,7 +124,7 @@ def linear_solves():
     assert [ksp.getType() for ksp in kinds] == ["cg", "minres"]
     for share in (1.1, 0.7):
         free = problem.fluid & (np.random.default_rng(61).random(shape) < share)
-        grid.hold(lcp.A.layout.load(free[boxes.box.slices], wp.uint8))
+        grid.set_free_set(lcp.A.layout.load(free[boxes.box.slices], wp.uint8))
         x, b = random_vector(grid, boxes, shape, 41)
         expected = scipy.sparse.linalg.spsolve(on_all_cells(problem, free), x.ravel()).reshape(
             shape

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from grid_fields import uniform_velocity
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.advection import MAX_CLEARANCE, advect, clearance
-from warp_lcp.grid.particles import MARGIN
+from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((8, 6, 1), 0.1, 2)

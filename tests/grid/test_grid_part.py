@@ -8,7 +8,8 @@ from warp_lcp.grid.advection import advect, advect_with_distance, clearance
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.domain_sides import side_bits
 from warp_lcp.grid.level_set import particle_density
-from warp_lcp.grid.particles import Particles, seed
+from warp_lcp.grid.particle_seeding import seed
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.signed_distance import Sphere
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.transfer import faces_to_particles, particles_to_faces

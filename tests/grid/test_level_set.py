@@ -10,7 +10,8 @@ import pytest
 import warp as wp
 
 from warp_lcp.grid.level_set import LevelSet, whole_cell_capacity
-from warp_lcp.grid.particles import Particles, lattice
+from warp_lcp.grid.particle_seeding import lattice
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 
 AIR, SOLID = 0, 2

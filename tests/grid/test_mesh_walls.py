@@ -8,7 +8,7 @@ from mesh_checks import assert_closed, enclosed
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.mesh_walls import OVERLAP
 from warp_lcp.grid.motion import Translation
-from warp_lcp.grid.particles import lattice
+from warp_lcp.grid.particle_seeding import lattice
 from warp_lcp.grid.signed_distance import Box, Geometry, Placement, Plane, Sphere
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import SurfaceMesh, SurfaceObstacles

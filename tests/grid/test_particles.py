@@ -5,15 +5,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import warp_lcp as wl
-from warp_lcp.grid.particles import (
-    MARGIN,
-    SORT_EVERY,
-    Particles,
-    _rows_of_sort,
-    lattice,
-    seed,
-    sort_keys,
-)
+from warp_lcp.grid.particle_loops import MARGIN
+from warp_lcp.grid.particle_seeding import lattice, seed
+from warp_lcp.grid.particles import SORT_EVERY, Particles, _rows_of_sort
+from warp_lcp.grid.radix_sort import sort_keys
 from warp_lcp.grid.staggered import StaggeredGrid
 
 FLAT = StaggeredGrid((7, 5, 1), 0.2, 2)

@@ -11,7 +11,8 @@ import warp as wp
 
 from mesh_checks import assert_closed, enclosed, pieces
 from warp_lcp.grid.level_set import LevelSet
-from warp_lcp.grid.particles import Particles, lattice
+from warp_lcp.grid.particle_seeding import lattice
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import (
     FilledInterior,

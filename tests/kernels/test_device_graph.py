@@ -51,11 +51,11 @@ def test_a_pass_visits_the_rows_of_each_run(seed):
     field, memory = wp.ones(SHAPE, dtype=wp.float32, device=DEVICE), DeviceRows()
     program, places = DeviceGraph(DEVICE), boxes(seed, 6)
     first = Rows.box(*places[0], DEVICE, cells=1)
-    memory.take(first.single, places[0][0])
+    memory.set_layout(first.single, places[0][0])
     program.record_pass(CLEAR[wp.float32].bind(replace(first, memory=memory), field=field))
     program.finish()
     for box in places:
-        memory.take(Rows.box(*box, DEVICE, cells=1).single, box[0])
+        memory.set_layout(Rows.box(*box, DEVICE, cells=1).single, box[0])
         field.fill_(1.0)
         expected = np.ones(SHAPE, dtype=np.float32)
         expected[part(box)] = 0.0
@@ -76,7 +76,7 @@ def test_cells_and_numbers_are_those_of_each_run(seed):
     def move(box):
         window = Window(*box, DEVICE)
         cells = window._cells(1)
-        memory.take_dim(cells, (*window.rows, cells.chunks))
+        memory.set_dim(cells, (*window.rows, cells.chunks))
         return window, cells
 
     window, cells = move(places[0])
@@ -104,7 +104,7 @@ def test_a_list_may_be_replaced_and_grow():
     lists = [wp.zeros(n, dtype=wp.float32, device=DEVICE) for n in (10, 7, 12, 20)]
     memory, slot, change = DeviceRows(1.25), Slot(), Scalar(2.0)
     program = DeviceGraph(DEVICE)
-    memory.take(Rows.listed(10, DEVICE, 1).single)
+    memory.set_layout(Rows.listed(10, DEVICE, 1).single)
     slot.point_to(lists[0])
     program.record_tasks(
         add_kernel, (10,), [wp.vec2i(0, 0), lists[0], change], None, memory.sized, memory
@@ -112,7 +112,7 @@ def test_a_list_may_be_replaced_and_grow():
     program.record(DeviceCopy(lists[3], None))
     program.finish()
     for values, number in ((lists[0], 2.0), (lists[1], -3.0), (lists[2], 4.5)):
-        memory.take(Rows.listed(len(values), DEVICE, 1).single)
+        memory.set_layout(Rows.listed(len(values), DEVICE, 1).single)
         slot.point_to(values)
         change.value = number
         assert program.fits()
@@ -120,7 +120,7 @@ def test_a_list_may_be_replaced_and_grow():
         np.testing.assert_array_equal(
             values.numpy(), np.full(len(values), number, dtype=np.float32)
         )
-    memory.take(Rows.listed(20, DEVICE, 1).single)
+    memory.set_layout(Rows.listed(20, DEVICE, 1).single)
     assert not program.fits()  # it must be captured again
 
 

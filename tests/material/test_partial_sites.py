@@ -13,7 +13,7 @@ from small_liquids import box, create, scene
 from small_sands import create as create_sand
 from small_sands import scene as sand_scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.grid.particles import seed
+from warp_lcp.grid.particle_seeding import seed
 from warp_lcp.material.particle_assembly import region_of
 
 PER_AXIS = 2

@@ -29,7 +29,7 @@ def masked_hierarchy(
     A = wl.GridPoisson(cells, periodic=periodic, device=device, dtype=wp.float64, **faces)
     hierarchy = Hierarchy(A.stencil, real, bounded=bounded, settings=settings)
     mask = A.layout.load(free.astype(np.uint8) * (cells == wl.FLUID).astype(np.uint8), wp.uint8)
-    hierarchy.hold(A.stencil.d, mask)
+    hierarchy.mask_diagonal(A.stencil.d, mask)
     hierarchy.rebuild()
     return A, hierarchy
 

@@ -269,7 +269,7 @@ def made(A, settings=None):
 
 def hold(A, hierarchy, free):
     """Set a free set, as methods do."""
-    hierarchy.hold(A.stencil.d, wp.array(free.astype(np.uint8), device=A.device))
+    hierarchy.mask_diagonal(A.stencil.d, wp.array(free.astype(np.uint8), device=A.device))
     hierarchy.rebuild_changed()
 
 

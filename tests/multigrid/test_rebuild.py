@@ -70,9 +70,9 @@ def test_changed_rows_give_what_a_complete_rebuild_gives(shape, periodic, number
     )
     assert len(whole.levels) > 2
     for free in sets(cells, rng):
-        partly.hold(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
+        partly.mask_diagonal(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
         partly.rebuild_changed()
-        whole.hold(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
+        whole.mask_diagonal(A.stencil.d, stored(A, free & (cells == wl.FLUID)))
         whole.rebuild()
         for one, other in zip(snapshot(partly), snapshot(whole), strict=True):
             np.testing.assert_array_equal(one, other)
@@ -83,18 +83,18 @@ def test_rows_that_nothing_changed_are_not_touched(device):
     cells, A = operator((32, 32, 32), (False,) * 3, {}, True, device, rng)
     hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
     fluid = cells == wl.FLUID
-    hierarchy.hold(A.stencil.d, stored(A, fluid))
+    hierarchy.mask_diagonal(A.stencil.d, stored(A, fluid))
     hierarchy.rebuild_changed()
     assert not hierarchy.finest.changed.numpy().any()
     spoiled = [lv.stencil.d for lv in hierarchy.levels[1:]] + [hierarchy._dense.inverse]
     for field in spoiled:
         field.fill_(7.0)
-    hierarchy.hold(A.stencil.d, stored(A, fluid))
+    hierarchy.mask_diagonal(A.stencil.d, stored(A, fluid))
     hierarchy.rebuild_changed()
     assert all((field.numpy() == 7).all() for field in spoiled)
     row = tuple(np.argwhere(fluid)[0])
     fluid[row] = False
-    hierarchy.hold(A.stencil.d, stored(A, fluid))
+    hierarchy.mask_diagonal(A.stencil.d, stored(A, fluid))
     assert np.argwhere(hierarchy.finest.changed.numpy()).tolist() == [list(row[:2])]
     hierarchy.rebuild_changed()
     level = hierarchy.levels[1].stencil
@@ -108,10 +108,10 @@ def test_the_first_rebuild_after_new_cells_is_complete(device):
     cells, A = operator((16, 16, 16), (False,) * 3, {}, False, device, rng)
     partly = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
     for _ in range(3):
-        partly.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        partly.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
         partly.rebuild_changed()
         fresh = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
-        fresh.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        fresh.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
         fresh.rebuild()
         for one, other in zip(snapshot(partly), snapshot(fresh), strict=True):
             np.testing.assert_array_equal(one, other)
@@ -198,10 +198,10 @@ def test_new_cells_and_weights_rebuild_the_rows_that_they_change(arrays, real, d
             cells = scene(rng)
         A.update(wp.array(cells, dtype=wp.int8, device=device))
         partly.refresh()
-        partly.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        partly.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
         partly.rebuild_changed()
         fresh = Hierarchy(A.stencil, real, bounded=False, settings=SETTINGS)
-        fresh.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+        fresh.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
         fresh.rebuild()
         for one, other in zip(snapshot(partly), snapshot(fresh), strict=True):
             np.testing.assert_array_equal(one, other)
@@ -234,7 +234,7 @@ def test_weights_that_keep_every_diagonal_change_their_rows(real, device):
             hierarchies, (Hierarchy.rebuild_changed, Hierarchy.rebuild), strict=True
         ):
             hierarchy.refresh()
-            hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+            hierarchy.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
             rebuild(hierarchy)
         for one, other in zip(*map(snapshot, hierarchies), strict=True):
             np.testing.assert_array_equal(one, other)
@@ -244,9 +244,9 @@ def test_new_cells_that_are_the_old_ones_change_no_row(device):
     rng = np.random.default_rng(831)
     cells, A = operator((16, 16, 40), (False,) * 3, {}, True, device, rng)
     hierarchy = Hierarchy(A.stencil, wp.float32, bounded=False, settings=SETTINGS)
-    hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+    hierarchy.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
     hierarchy.rebuild_changed()
     A.update(wp.array(cells.astype(np.int8), device=device))
     hierarchy.refresh()
-    hierarchy.hold(A.stencil.d, stored(A, cells == wl.FLUID))
+    hierarchy.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
     assert not hierarchy.finest.changed.numpy().any()

@@ -88,7 +88,7 @@ def test_restricted_residuals_are_those_of_a_loop(shape, kind, fused, device):
     apart = CycleSettings(one_launch_cpu=0, one_launch_cuda=0)
     hierarchy = Hierarchy(A.stencil, wp.float64, bounded=False, settings=apart)
     inside = (cells == wl.FLUID).astype(np.uint8)
-    hierarchy.hold(A.stencil.d, A.layout.load(inside, wp.uint8))
+    hierarchy.mask_diagonal(A.stencil.d, A.layout.load(inside, wp.uint8))
     hierarchy.rebuild()
     fine, coarse = hierarchy.levels[:2]
     fine.x.assign(A.layout.load(rng.standard_normal(shape) * inside, wp.float64))
@@ -116,7 +116,7 @@ def test_coarser_levels_restrict_with_the_weights_of_each_row(symmetric, device)
     A = wl.Stencil(cells, given, outside=wl.AIR, device=device, dtype=wp.float64)
     hierarchy = Hierarchy(A.stencil, wp.float64, bounded=False)
     inside = (cells == wl.FLUID).astype(np.uint8)
-    hierarchy.hold(A.stencil.d, A.layout.load(inside, wp.uint8))
+    hierarchy.mask_diagonal(A.stencil.d, A.layout.load(inside, wp.uint8))
     hierarchy.rebuild()
     fine, coarse = hierarchy.levels[1:3]
     pattern, counts = fine.stencil.pattern, fine.stencil.padding.counts

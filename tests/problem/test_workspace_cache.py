@@ -121,8 +121,10 @@ def test_a_kept_workspace_has_the_bits_of_a_new_one(seed, monkeypatch):
     )
     wl.set_threads(1 + seed % 2)
     reused = []
-    take = LCP.take
-    monkeypatch.setattr(LCP, "take", lambda self, other: [take(self, other), reused.append(other)])
+    copy_from = LCP.copy_from
+    monkeypatch.setattr(
+        LCP, "copy_from", lambda self, other: [copy_from(self, other), reused.append(other)]
+    )
     problems = drawn_problems(rng, shape, bounds, coefficients, dtype=dtype, **options)
     stopping = wl.StoppingCriteria(rtol=1e-3)  # above the floor of single precision
     for problem in [*problems, *problems[::-1], *problems]:

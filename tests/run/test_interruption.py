@@ -159,7 +159,7 @@ def test_a_compiler_is_not_waited_for(monkeypatch):
     """
 
     class CompilingInterruption(Interruption):
-        def _take(self, given: int, frame: Any) -> None:
+        def _handle_signal(self, signal_number: int, frame: Any) -> None:
             pass
 
     messages, ended = [], threading.Event()

@@ -16,7 +16,7 @@ import warp_lcp as wl
 from default_run import few
 from oracle import natural_residual
 from warp_lcp.default_chain import CentralPathStalls
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase, method_name
+from warp_lcp.problem.method_protocol import Step, WorkspaceBase, method_name
 from warp_lcp.solvers.fallback import FIRST, Progress
 
 TURN = np.array([[0.0, 1.0], [-1.0, 0.0]])

@@ -270,7 +270,7 @@ def test_what_the_minimum_map_holds_goes_to_its_bound(precision, periodic):
     low, high = fluid & (x - y / d < l), fluid & (x - y / d > u)
     assert residual.away
     assert residual.active == np.count_nonzero(low | high)
-    residual.hold(work.x)
+    residual.project_held(work.x)
     rounded = (
         (lambda a: a.astype(np.float32).astype(np.float64))
         if precision == "single"

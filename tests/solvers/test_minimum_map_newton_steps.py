@@ -177,7 +177,7 @@ def test_index_sets_on_a_grid(bounds):
     free = finest.stencil.d.numpy().ravel()[place] != 0
     np.testing.assert_array_equal(free, ~(below | above))
     assert residual.active == (below | above).sum()
-    residual.hold(work.x)
+    residual.project_held(work.x)
     np.testing.assert_array_equal(
         work.x.numpy()[place], np.where(below, lower, np.where(above, upper, x))
     )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import glob
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,7 @@ from warp_lcp.cli.view_commands import export, render, serve, show_while_running
 from warp_lcp.default_chain import default_chain
 from warp_lcp.distributed.watchdog import LIMIT
 from warp_lcp.extras.viewer import check_window
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.operator_protocol import families
@@ -30,8 +31,7 @@ from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, ve
 from warp_lcp.run.estimate import doubts, estimate_run
 from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
 from warp_lcp.run.interruption import Interruption
-from warp_lcp.run.launcher import default_folder
-from warp_lcp.run.launcher_choice import launcher_of
+from warp_lcp.run.launcher import Launcher, default_folder
 from warp_lcp.run.loop import RunRequest
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.run.profile import Profiler
@@ -56,6 +56,26 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
+
+
+@contextmanager
+def launcher_of(engine: Engine, *, rank_timeout: float) -> Iterator[Launcher]:
+    """Yield the launcher of a command: one process, or the ranks together.
+
+    Args:
+        engine: engine that runs the command.
+        rank_timeout: longest time that ranks wait for one of them [s]; 0: no limit.
+
+    Raises:
+        EngineError: the engine cannot be used here.
+    """
+    if engine is Engine.SINGLE:
+        yield Launcher()
+        return
+    from warp_lcp.run.rank_launcher import ranks_together  # needs MPI and PETSc
+
+    with ranks_together(rank_timeout) as launcher:
+        yield launcher
 
 
 def _matching_names(word: str, names: Iterable[str]) -> list[str]:

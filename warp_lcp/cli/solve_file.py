@@ -18,9 +18,9 @@ from warp_lcp.method_selection import solve
 from warp_lcp.operators import DenseOperator, SparseOperator
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.operator_protocol import families
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.run.problem_folder import ProblemError
 from warp_lcp.settings import SettingError

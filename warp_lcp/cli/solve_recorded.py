@@ -16,8 +16,8 @@ import warp as wp
 
 from warp_lcp.cli.solve_file import FileOutcome, criteria, method_named
 from warp_lcp.default_chain import default_chain
+from warp_lcp.files import Tables
 from warp_lcp.files.atomic import replacing, replacing_by_name
-from warp_lcp.files.tables import Tables
 from warp_lcp.method_selection import solve
 from warp_lcp.operators import GridPoisson
 from warp_lcp.problem.lcp import LCP

@@ -12,8 +12,9 @@ from warp_lcp.contacts.articulated_figure import ArticulatedFigure
 from warp_lcp.default_chain import default_chain
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Solver, solve
+from warp_lcp.problem.solve_loop import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import CountOrZero, NonNegative, Positive, Settings
 from warp_lcp.solvers.incremental_pivoting import IncrementalPivoting

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from warp_lcp.contacts.kinematics import TargetPath, tree_of
 from warp_lcp.contacts.methods import BOXED, CONE, DEFAULT, JOINTED, KINEMATIC, STEWART_TRINKLE
-from warp_lcp.problem.solve_loop import PrecisionName
+from warp_lcp.problem.method_protocol import PrecisionName
 from warp_lcp.rigid.joints import WORLD, Joint, JointKind
 from warp_lcp.scene.presets import PresetName
 from warp_lcp.scene.scene import MOST_CELLS, Domain, Output, Scene

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_lcp.distributed.components import GROUND, joined, nodes_of
+from warp_lcp.distributed.halo import GROUND, connected_components, number_nodes
 from warp_lcp.grid.grid_part import BodyNumbers
 from warp_lcp.grid.staggered import Window
 
@@ -75,7 +75,7 @@ class FragmentMerger:
             return BodyNumbers(trees)
         planes = planes or self._nodes_at_cuts(seen, *cell_fields)
         # The nodes of this rank's planes are exchanged; a cell that two ranks know is an edge.
-        first, count = nodes_of(ranks, everyone[:, 0])
+        first, count = number_nodes(ranks, everyone[:, 0])
         grid = np.full(part.grid.shape, ALONE, dtype=np.int32)
         for pair in planes:
             for _, nodes in pair:
@@ -87,7 +87,7 @@ class FragmentMerger:
         for _, (cells, nodes) in planes:
             both = np.stack([nodes.ravel(), grid[cells].ravel()], axis=1)
             edges.append(both[(both > ALONE).all(axis=1)])
-        component = joined(ranks, count, np.unique(np.concatenate(edges), axis=0))
+        component = connected_components(ranks, count, np.unique(np.concatenate(edges), axis=0))
         # Bodies of several trees are numbered first, then those that are this rank's alone.
         several = np.bincount(component) > 1
         several[component[GROUND]] = False

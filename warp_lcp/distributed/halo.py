@@ -10,9 +10,10 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, no_type_check
 
 import numpy as np
+import scipy.sparse
+import scipy.sparse.csgraph
 import warp as wp
 
-from warp_lcp.distributed.components import GROUND, joined, nodes_of
 from warp_lcp.distributed.launch import petsc
 from warp_lcp.distributed.messages import exchange, exchange_operation
 from warp_lcp.distributed.ranks import Ranks
@@ -25,6 +26,36 @@ if TYPE_CHECKING:
     from petsc4py import PETSc
 
     from warp_lcp.distributed.decomposition import Decomposition
+
+GROUND = 0  # node of the graph of components that stands for all supports
+
+
+def number_nodes(ranks: Ranks, counts: np.ndarray) -> tuple[int, int]:
+    """Number the nodes of a graph whose nodes are the components within the ranks' boxes.
+
+    Args:
+        ranks: that have the components.
+        counts: number of components of each rank, shape (ranks,).
+
+    Returns:
+        The node of this rank's first component, and the number of all nodes with `GROUND`.
+    """
+    return 1 + int(counts[: ranks.rank].sum()), 1 + int(counts.sum())
+
+
+def connected_components(ranks: Ranks, nodes: int, edges: np.ndarray) -> np.ndarray:
+    """Return the number of each node's connected component, shape (nodes,); collective.
+
+    Args:
+        ranks: that have the components of their boxes, which are the nodes.
+        nodes: number of nodes.
+        edges: pairs of nodes that are connected, as far as this rank knows, int32, shape (n, 2).
+    """
+    all_edges = np.concatenate(ranks.collect(edges))
+    graph = scipy.sparse.coo_matrix(
+        (np.ones(len(all_edges)), tuple(all_edges.T)), shape=(nodes, nodes)
+    )
+    return np.asarray(scipy.sparse.csgraph.connected_components(graph, directed=False)[1])
 
 
 class Halo:
@@ -107,9 +138,9 @@ class Halo:
         """
         ranks = self.decomposition.ranks
         # Nodes of the graph: GROUND for all held components, then the free ones, rank by rank.
-        first, nodes = nodes_of(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
+        first, nodes = number_nodes(ranks, ranks.gather(int(number.max(initial=-1)) + 1))
         node = np.where(number >= 0, number + first, np.where(held, GROUND, -1)).astype(np.int32)
-        component = joined(ranks, nodes, self._edges(node, faces))
+        component = connected_components(ranks, nodes, self._edges(node, faces))
         floating = component != component[GROUND]
         if not floating.any():
             return None

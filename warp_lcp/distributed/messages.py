@@ -82,18 +82,18 @@ class MpiMailbox:
 
 @wp.func_native("""
 #ifndef __CUDA_ARCH__
-unsigned long long* told = (unsigned long long*)told_;
-__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+unsigned long long* progress = (unsigned long long*)progress_;
+__atomic_fetch_add(progress, 1, __ATOMIC_SEQ_CST);
 typedef int Fault; typedef Fault (*Call)(void*, void*, const void*, void*, void*);
 const Call calls[2] = {(Call)begin_, (Call)end_};
 const unsigned long long* pairs = (const unsigned long long*)pairs_;
 for (int i = 0; i < 2; ++i)
     for (int p = 0; p < count; ++p)
-        if (!told[1]) {
+        if (!progress[1]) {
             const unsigned long long* pair = pairs + 3*p;
-            told[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], \
+            progress[1] = calls[i](*(void**)forest_, (void*)pair[0], (const void*)pair[1], \
 (void*)pair[2], (void*)replace_); }
-__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+__atomic_fetch_add(progress, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
 def copy_to_leaves(
@@ -103,7 +103,7 @@ def copy_to_leaves(
     pairs_: wp.uint64,
     replace_: wp.uint64,
     count: int,
-    told_: wp.uint64,
+    progress_: wp.uint64,
 ):
     """Copy roots to leaves: PetscSFBcastBegin for each pair, then PetscSFBcastEnd.
 
@@ -114,17 +114,17 @@ def copy_to_leaves(
 
 @wp.func_native("""
 #ifndef __CUDA_ARCH__
-unsigned long long* told = (unsigned long long*)told_; double* sums = (double*)sums_; \
-double* of_all = (double*)of_all_;
-__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+unsigned long long* progress = (unsigned long long*)progress_; double* sums = (double*)sums_; \
+double* gathered = (double*)gathered_;
+__atomic_fetch_add(progress, 1, __ATOMIC_SEQ_CST);
 typedef int Fault; typedef Fault (*Call)(const void*, int, void*, void*, int, void*, void*);
-if (!told[1]) told[1] = ((Call)gather_)(sums, count, (void*)unit_, \
-of_all, count, (void*)unit_, (void*)comm_);
+if (!progress[1]) progress[1] = ((Call)gather_)(sums, count, (void*)unit_, \
+gathered, count, (void*)unit_, (void*)comm_);
 for (int c = 0; c < count; ++c) {
-    double sum = of_all[c];
-    for (int r = 1; r < ranks; ++r) sum += of_all[r*count + c];
+    double sum = gathered[c];
+    for (int r = 1; r < ranks; ++r) sum += gathered[r*count + c];
     sums[c] = sum; }
-__atomic_fetch_add(told, 1, __ATOMIC_SEQ_CST);
+__atomic_fetch_add(progress, 1, __ATOMIC_SEQ_CST);
 #endif
 """)
 def add_of_all(
@@ -132,10 +132,10 @@ def add_of_all(
     unit_: wp.uint64,
     comm_: wp.uint64,
     sums_: wp.uint64,
-    of_all_: wp.uint64,
+    gathered_: wp.uint64,
     count: int,
     ranks: int,
-    told_: wp.uint64,
+    progress_: wp.uint64,
 ):
     """Call MPI_Allgather, and add up in the order of the ranks."""
 
@@ -148,10 +148,10 @@ def exchange_kernel(
     pairs: wp.uint64,
     replace: wp.uint64,
     count: int,
-    told: wp.uint64,
+    progress: wp.uint64,
 ):
     """Copy roots to leaves over a star forest; one thread, on the CPU."""
-    copy_to_leaves(begin, end, forest, pairs, replace, count, told)
+    copy_to_leaves(begin, end, forest, pairs, replace, count, progress)
 
 
 @forward_kernel(module="warp_lcp.messages")
@@ -160,13 +160,13 @@ def add_kernel(
     unit: wp.uint64,
     comm: wp.uint64,
     sums: wp.uint64,
-    of_all: wp.uint64,
+    gathered: wp.uint64,
     count: int,
     ranks: int,
-    told: wp.uint64,
+    progress: wp.uint64,
 ):
     """Add the sums of the other ranks; one thread, on the CPU."""
-    add_of_all(gather, unit, comm, sums, of_all, count, ranks, told)
+    add_of_all(gather, unit, comm, sums, gathered, count, ranks, progress)
 
 
 class _Library:

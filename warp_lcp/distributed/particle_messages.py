@@ -57,7 +57,7 @@ class Buffer:
             self._allocate(2 * count)
             self.host[:keep] = before[:keep]
 
-    def take(self, values: np.ndarray) -> None:
+    def store(self, values: np.ndarray) -> None:
         """Store these values."""
         self.reserve(values.size)
         self.host[: values.size] = values.ravel()
@@ -90,7 +90,7 @@ class ParticleMessages:
         self._device, self._count, self._come = wp.get_device("cpu"), Scalar(), Scalar()
         self._bounds = bounds_of(part)
         self._end = beyond(part.decomposition.counts, part.grid.spacing)
-        self._ends = self._take_boxes()
+        self._ends = self._store_boxes()
         self._copies: dict[str, DeviceArray] = {}
         # Columns of a GPU are copied to new arrays in each run.
         copied = particles.grid.device.is_cuda
@@ -104,7 +104,7 @@ class ParticleMessages:
         graphs = (LaunchGraph(self._device, launch, at_once=copied) for launch in launches)
         self._packing, self._unpacking, self._settling, self._search, self._giving = graphs
 
-    def _take_boxes(self) -> list[int]:
+    def _store_boxes(self) -> list[int]:
         """Set the search boxes; return the number of particles for each neighbor.
 
         This rank comes last. A neighbor needs the particles in its box and within REACH of it, at
@@ -122,8 +122,8 @@ class ParticleMessages:
             part.decomposition.boxes[rank].grown(REACH).moved(shift, -1) for rank, shift in seen
         ]
         table = [limits, _corners(part.box), *map(_corners, boxes)]
-        self._boxes.take(np.array(table, dtype=np.int32))
-        self._offsets.take(
+        self._boxes.store(np.array(table, dtype=np.int32))
+        self._offsets.store(
             np.array([shift for _, shift in seen], dtype=np.float64).reshape(-1, 3)
             * part.grid.spacing
         )

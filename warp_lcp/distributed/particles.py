@@ -80,7 +80,7 @@ class ParticleMigration(ParticleExchange):
 
     @place.setter
     def place(self, place: np.ndarray) -> None:
-        self._places.take(place)
+        self._places.store(place)
         self._placed = len(place)
 
     @property

@@ -42,21 +42,24 @@ def migrate(piece: Piece, particles: Sequence[str], before: Subdomain, now: Subd
     new_piece = {**piece, "box": np.array([now.box.low, now.box.high])}
     for name in (*particles, "place"):
         values = np.asarray(piece[name])
-        come = now.mailbox.swap({rank: values[owner == rank].ravel() for rank in other_ranks})
+        incoming = now.mailbox.swap({rank: values[owner == rank].ravel() for rank in other_ranks})
         new_piece[name] = np.concatenate(
-            [values[owner == own_rank], *(found.reshape(-1, *values.shape[1:]) for found in come)]
+            [
+                values[owner == own_rank],
+                *(received.reshape(-1, *values.shape[1:]) for received in incoming),
+            ]
         )
     for name, values in fields_of(piece).items():
         new_piece[name] = np.zeros((*values.shape[:-3], *now.box.counts[::-1]), dtype=values.dtype)
         sent = {
             rank: _cut_out(values, old[own_rank], new[rank]) for rank in (own_rank, *other_ranks)
         }
-        for rank, found in zip(
+        for rank, received in zip(
             (own_rank, *other_ranks), [sent.pop(own_rank), *now.mailbox.swap(sent)], strict=True
         ):
             box = old[rank].common(new[own_rank])
             if box.cells:
-                new_piece[name][..., *box.moved(now.box.low, -1).slices] = found.reshape(
+                new_piece[name][..., *box.moved(now.box.low, -1).slices] = received.reshape(
                     *values.shape[:-3], *box.counts[::-1]
                 )
     return new_piece

@@ -29,6 +29,7 @@ from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import HostTask, is_recording, launch, run_table
+from warp_lcp.kernels.recorded_arguments import slot_of
 from warp_lcp.kernels.thread_pool import Operation, OperationTable, team
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Communicator, convert
@@ -74,7 +75,7 @@ for _T in (wp.int8, wp.uint8, wp.float32, wp.float64):
 
 def _stays(field: wp.array | np.ndarray) -> bool:
     """Return whether a recorded launch may identify a field by its address."""
-    return isinstance(field, wp.array) and field.device.is_cpu and not hasattr(field, "slot")
+    return isinstance(field, wp.array) and field.device.is_cpu and slot_of(field) is None
 
 
 def copy_cells(to: DeviceArray, source: DeviceArray) -> None:

@@ -39,18 +39,18 @@ class SummationOrder:
             count: particles without the others.
         """
         end = min(count, len(self.places))
-        gaps, others = (
+        gaps, unsorted = (
             self.loose[self.loose < end],
             np.append(self.loose, np.arange(count, len(place))),
         )
-        others = others[np.argsort(place[others], kind="stable")]
+        unsorted = unsorted[np.argsort(place[unsorted], kind="stable")]
         # Sorted particle before which each of them belongs.
-        before = np.searchsorted(self.places[:end], place[others], side="right")
+        before = np.searchsorted(self.places[:end], place[unsorted], side="right")
         cuts = np.sort(np.concatenate([[0, end], before, gaps, gaps + 1]), kind="stable")
         held = cuts[1:] > cuts[:-1]
         held[held] = ~np.isin(cuts[:-1][held], gaps)
         begins, ends = (
-            np.append(others + last, cuts[last : len(cuts) - 1 + last][held]) for last in (0, 1)
+            np.append(unsorted + last, cuts[last : len(cuts) - 1 + last][held]) for last in (0, 1)
         )
         order = np.argsort(np.append(before, cuts[:-1][held]), kind="stable")
         return np.stack([begins[order], ends[order]], axis=1).ravel()

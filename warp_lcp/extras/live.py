@@ -25,8 +25,8 @@ from urllib.parse import parse_qs, urlsplit
 import numpy as np
 import warp as wp
 
+from warp_lcp.files import Tables
 from warp_lcp.files.atomic import open_in_place
-from warp_lcp.files.tables import Tables
 from warp_lcp.grid.motion import Motion, Pose
 from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.render.recording import PALETTES, Recording, RenderError, VisiblePart

@@ -88,17 +88,20 @@ class VectorCopies:
         ).launch()
 
     def leave(
-        self, field: DeviceArray, others: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
+        self, field: DeviceArray, outside: PETSc.Vec | None, v: PETSc.Vec, scale: float = 1.0
     ) -> None:
         """Set v to scale times the field on the unknowns.
 
-        On the other cells v becomes `others`, or 0 if that is None.
+        On the other cells v becomes `outside`, or 0 if that is None.
         """
-        given = None if others is None else others.getArray(readonly=True)
+        outside_values = None if outside is None else outside.getArray(readonly=True)
         values = v.getArray()
-        seen, target = None if given is None else self._view(given, 0), self._view(values, 1)
+        outside_view, target = (
+            None if outside_values is None else self._view(outside_values, 0),
+            self._view(values, 1),
+        )
         LEAVE.bind(
-            self._rows, x=field, d=self.stencil.d, others=seen, v=target, scale=scale
+            self._rows, x=field, d=self.stencil.d, others=outside_view, v=target, scale=scale
         ).launch()
         if self._staging:
             values[:] = target.numpy()
@@ -211,7 +214,7 @@ class PetscGrid:
     Args:
         A: the operator, of one process or distributed over ranks.
         hierarchy: of A, its finest diagonal filled by the caller; None: one of its own, for all
-            unknowns until `hold` is called.
+            unknowns until `set_free_set` is called.
         real: type in which its cycles work.
         cycle: settings of the cycles.
 
@@ -250,7 +253,7 @@ class PetscGrid:
         self.matrix = self._keep(StencilMatrix(finest, self.copies).as_mat())
         self.cycle = CyclePreconditioner(self.hierarchy, self.copies)
         if hierarchy is None:
-            self.hold(A.layout.load(np.ones(A.shape), wp.uint8))
+            self.set_free_set(A.layout.load(np.ones(A.shape), wp.uint8))
 
     @cached_property
     def operator(self) -> PETSc.Mat:
@@ -270,9 +273,9 @@ class PetscGrid:
         """Return the values of a vector as a field of A's shape, a copy."""
         return v.getArray(readonly=True).reshape(self._A.shape).copy()
 
-    def hold(self, free: DeviceArray) -> None:
+    def set_free_set(self, free: DeviceArray) -> None:
         """Set another free set, a stored uint8 field; other unknowns are held fixed."""
-        self.hierarchy.hold(self._A.stencil.d, free)
+        self.hierarchy.mask_diagonal(self._A.stencil.d, free)
         self.hierarchy.rebuild_changed()
         self.matrix.stateIncrease()
 

@@ -15,6 +15,7 @@ from warp_lcp.linear_complementarity import STATUSES, linear_complementarity
 from warp_lcp.problem.bounds import huge_as_infinite
 from warp_lcp.problem.data_types import Matrix, Values, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.program_optimality import (
     PROVABLE,
     ProgramPoint,
@@ -29,7 +30,6 @@ from warp_lcp.problem.program_optimality import (
 )
 from warp_lcp.problem.reformulate import QuadraticProgramData, quadratic_program_to_boxed
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.solvers.interior_point import InteriorPoint
 from warp_lcp.solvers.lemke import Lemke
 from warp_lcp.solvers.quadratic_program import is_convex_program
@@ -200,7 +200,7 @@ class _Solve:
     def _box(self) -> None:
         """Solve the boxed LCP of P and q in the caller's units."""
         p = self.program
-        self.result = found = linear_complementarity(
+        self.result = result = linear_complementarity(
             p.Q,
             p.c,
             bounds=(p.lower, p.upper),
@@ -210,7 +210,7 @@ class _Solve:
             maxiter=self.maxiter,
         )
         x = np.where(
-            found.active_mask < 0, p.lower, np.where(found.active_mask > 0, p.upper, found.x)
+            result.active_mask < 0, p.lower, np.where(result.active_mask > 0, p.upper, result.x)
         )
         self._judge(with_rows(p), ProgramPoint(x, np.zeros(0), np.zeros(0)), None)
 

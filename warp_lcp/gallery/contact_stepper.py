@@ -15,8 +15,9 @@ import warp as wp
 from warp_lcp.gallery.rigid_world import Assembly, World
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Solver, solve
+from warp_lcp.problem.solve_loop import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.rigid.contact_models import BoxedModel, ContactModel, ContactSystem
 from warp_lcp.solvers.psor import ProjectedSOR

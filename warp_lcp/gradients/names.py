@@ -9,9 +9,9 @@ from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import TypedDict, TypeVar, cast
 
 from warp_lcp.kernels.fields import Array
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.problem.operator_protocol import Operator
 from warp_lcp.problem.result import Record
-from warp_lcp.problem.solve_loop import Solver, Workspace
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 
 Name = str | tuple[str, Hashable]

@@ -292,11 +292,12 @@ def _adjoint(
     if has(A, HasRows) and not on_grid:
         # mu of an empty row is arbitrary: 0.
         free = free if A.row_sizes is None else free & (A.row_sizes.numpy() > 0)
-        matrix, near = A.rows().matrix()[free][:, free].T, getattr(A, "near_null_space", None)
+        matrix = A.rows().matrix()[free][:, free].T
+        near_null_space = A.near_null_space if isinstance(A, SparseOperator) else None
         block = (
             as_operator(matrix, problem.device)
-            if near is None
-            else SparseOperator(matrix, device=A.device, near_null_space=near[free])
+            if near_null_space is None
+            else SparseOperator(matrix, device=A.device, near_null_space=near_null_space[free])
         )
         result = solve(LCP(block, g.numpy()[free], -np.inf, np.inf), stopping=stopping)
         multiplier = np.zeros(layout.size)

@@ -49,9 +49,9 @@ class ActiveRows:
         self._rest = -1  # the step until which all is visited
         self.active = not grid.device.is_cuda and grid.size >= LEAST_CELLS
         if before is not None and self.active:
-            self._take(before)
+            self._copy_segments(before)
 
-    def _take(self, other: "ActiveRows") -> None:
+    def _copy_segments(self, other: "ActiveRows") -> None:
         """Copy the segments that another object has found."""
         if other._now is None:
             return

@@ -84,7 +84,7 @@ def cut_by_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, h: wp.vec3d, along: wp.v
     """
     low = a
     high = a
-    found = int(0)
+    count = int(0)
     for side in range(3):
         p = wp.where(side == 0, a, wp.where(side == 1, b, c))
         q = wp.where(side == 0, b, wp.where(side == 1, c, a))
@@ -96,12 +96,12 @@ def cut_by_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, h: wp.vec3d, along: wp.v
             x = p + (q - p) * (hp / (hp - hq))
             meets = True
         if meets:
-            if found == 0 or wp.dot(x, along) < wp.dot(low, along):
+            if count == 0 or wp.dot(x, along) < wp.dot(low, along):
                 low = x
-            if found == 0 or wp.dot(x, along) > wp.dot(high, along):
+            if count == 0 or wp.dot(x, along) > wp.dot(high, along):
                 high = x
-            found += 1
-    return low, high, found
+            count += 1
+    return low, high, count
 
 
 @wp.func

@@ -284,7 +284,7 @@ class _Records:
     def table(self, element: _Element) -> np.ndarray:
         """Return records without lists, float64 of shape (count, properties)."""
         if self.order is None:
-            words = self._take("f8", element.count * len(element.properties), element)
+            words = self._next_values("f8", element.count * len(element.properties), element)
             return np.array([_number(word) for word in words]).reshape(element.count, -1)
         record = np.dtype(
             [
@@ -301,10 +301,10 @@ class _Records:
         records: list[Sequence[int] | np.ndarray] = []
         for _ in range(element.count):
             for number, (_, kind, length) in enumerate(element.properties):
-                count = _index(self._take(length, 1, element)[0]) if length else 1
+                count = _index(self._next_values(length, 1, element)[0]) if length else 1
                 if count < 0:
                     raise ValueError(f"a list of a {element.name} has {count} entries")
-                entries = self._take(kind, count, element)
+                entries = self._next_values(kind, count, element)
                 if number == wanted:
                     if not isinstance(entries, np.ndarray):
                         entries = np.array([_index(word) for word in entries], dtype=np.int64)
@@ -319,7 +319,9 @@ class _Records:
     def _width(self, kind: str) -> int:
         return 1 if self.order is None else int(kind[1])
 
-    def _take(self, kind: str, count: int, element: _Element) -> Sequence[bytes] | np.ndarray:
+    def _next_values(
+        self, kind: str, count: int, element: _Element
+    ) -> Sequence[bytes] | np.ndarray:
         """Return the next numbers of a type, or words."""
         begin, self.at = self.at, self.at + count * self._width(kind)
         if not begin <= self.at <= self._size:

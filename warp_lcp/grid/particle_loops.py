@@ -59,7 +59,7 @@ class ListMemory:
         self.touched = wp.empty(2, dtype=wp.int32, device=device)
         self.slot("touched of").point_to(self.touched)
 
-    def take(self, count: int, arrays: Mapping[str, DeviceArray]) -> None:
+    def set_list(self, count: int, arrays: Mapping[str, DeviceArray]) -> None:
         """Use a list of this length and these arrays.
 
         Recorded launches refer to the arrays by name.
@@ -82,9 +82,9 @@ class ListMemory:
             return
         self.count.value = self._entries.value = count
         if self.device.is_cuda:
-            self.rows.take(chunks(count, self.device).single)
+            self.rows.set_layout(chunks(count, self.device).single)
         else:
-            self.rows.take_entries(count, CPU_GRAIN)
+            self.rows.set_entries(count, CPU_GRAIN)
         least = 2 * -(-max(count, 1) // CPU_GRAIN)
         if len(self.touched) < least:
             self.touched = wp.empty(2 * least, dtype=wp.int32, device=self.device)
@@ -93,7 +93,7 @@ class ListMemory:
 
 def list_of(array: object) -> ListMemory | None:
     """Return the list whose memory an array is part of; None if it is of none."""
-    listed: ListMemory | None = getattr(array, "listed", None)
+    listed: ListMemory | None = vars(array).get("listed") if isinstance(array, wp.array) else None
     return listed
 
 
@@ -211,8 +211,8 @@ def launch(
     rows, listed = chunks(count, grid.device), None
     if is_recording():
         members = [getattr(s, f.name) for s in structs for f in fields(s)]
-        found = (list_of(a) for a in (*kernel_args.values(), *members))
-        listed = next((one for one in found if one is not None), None)
+        memories = (list_of(a) for a in (*kernel_args.values(), *members))
+        listed = next((memory for memory in memories if memory is not None), None)
     if listed is not None:
         rows = replace(rows, memory=listed.rows)
     if count or listed is not None:

@@ -11,7 +11,9 @@ import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
-from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, MARGIN, ListMemory, launch
+from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, ListMemory, launch
+from warp_lcp.grid.particle_seeding import lattice, seed  # noqa: F401 - their older place
+from warp_lcp.grid.radix_sort import digits_of, sort_keys
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.fields import zeros
@@ -199,7 +201,7 @@ class Particles:
             *(f"affine_{c}" for c in range(grid.dimension if affine else 0)),
         ]
         self._names += ["kept"] * (kept is not None)
-        self._tally, columns, device = None, len(kernels.TOTAL.found), grid.device
+        self._tally, columns, device = None, len(kernels.TOTAL.reductions), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
         self._totals, self._numbering, self._sorting = (
             LaunchGraph(device, launch) for launch in launches
@@ -316,7 +318,7 @@ class Particles:
         if self._marks[0] != memory:
             self._marks = memory, self._order[self._capacity : self._capacity + self.count]
             self._stays = self._order[: self.count]
-            self._memory.take(self.count, {"marks": self._marks[1], "stays": self._stays})
+            self._memory.set_list(self.count, {"marks": self._marks[1], "stays": self._stays})
         return self._marks[1]
 
     def remove(self, marks: wp.array) -> int:
@@ -356,13 +358,13 @@ class Particles:
             )
             return
         columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
-        given: dict[str, object] = {
+        kernel_args: dict[str, object] = {
             "removed": self._removed.array,
             "marks": marks,
             "count": self._memory.count,
             **columns,
         }
-        kernels.CLOSE_RANKS.bind_arguments(Rows.entries(1, device), (), given).launch()
+        kernels.CLOSE_RANKS.bind_arguments(Rows.entries(1, device), (), kernel_args).launch()
 
     def finish_removal(self, marks: wp.array) -> tuple[int, int]:
         """End the removal that has been launched.
@@ -374,8 +376,8 @@ class Particles:
             How many particles with the mark 1 were removed, and how many with another.
         """
         self._removed.changed()
-        first, others = self._removed.numpy().tolist()
-        if first + others:
+        first, other_marks = self._removed.numpy().tolist()
+        if first + other_marks:
             if self.grid.device.is_cuda:
                 stay = self._order[: self.count]
                 wp.utils.array_scan(stay, stay, inclusive=True)
@@ -386,8 +388,8 @@ class Particles:
                     )
                     self._columns[name], self._spare = self._spare, column
             self.exchange.register_removal(marks)
-            self.resize(self.count - first - others)
-        return first, others
+            self.resize(self.count - first - other_marks)
+        return first, other_marks
 
     def gather_rows(self, order: np.ndarray) -> None:
         """Keep the particles with these numbers, in this order."""
@@ -432,7 +434,7 @@ class Particles:
     def set_runs(self, runs: wp.array) -> None:
         """Let sums take the particles in the order of `runs`."""
         self.runs = runs
-        self._memory.take(self.count, {"runs": runs})
+        self._memory.set_list(self.count, {"runs": runs})
 
     def resize(self, count: int) -> None:
         """Set the number of particles; new ones have undefined values."""
@@ -452,16 +454,16 @@ class Particles:
         """Publish the number and the arrays of the particles to recorded launches."""
         count, memory = self.count, self._memory
         if count != memory.count.value and self._tally is not None:
-            self._total_rows.take(self._rows_of_totals().summed)
+            self._total_rows.set_layout(self._rows_of_totals().summed)
         elif count != memory.count.value:
-            self._places.value = self._total_rows.take_entries(
+            self._places.value = self._total_rows.set_entries(
                 count, _chunk_of_totals(count, self.grid.device)
             )
-            self._sort_pieces.value = self._sort_rows.take_entries(count, _piece_of_sort(count))
+            self._sort_pieces.value = self._sort_rows.set_entries(count, _piece_of_sort(count))
         for name, column in self._columns.items():
             column.publish(memory, name)
         self._spare.publish(memory, "spare")
-        memory.take(count, {"key": self.key})
+        memory.set_list(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
         """Enlarge the storage to at least `count` particles; keep the first `before`."""
@@ -651,7 +653,7 @@ class Particles:
             velocity=self.velocity,
             out=self._partials,
         ).launch()
-        columns = Rows.flat(len(kernels.TOTAL.found), self.grid.device, serial=True)
+        columns = Rows.flat(len(kernels.TOTAL.reductions), self.grid.device, serial=True)
         kernels.ADD_IN_ORDER.bind(
             columns,
             partials=self._partials,
@@ -732,168 +734,8 @@ def _halves(array: wp.array) -> tuple[wp.array, wp.array]:
     return array[:half], array[half:]
 
 
-def digits_of(bits: int) -> tuple[int, int]:
-    """Return the number of rounds of a radix sort, and the bits of a round."""
-    # An even number of rounds, so that the last one ends in the keys' own array. 2048 digits of a
-    # round stay in the L1 cache.
-    rounds = 2 * -(-bits // 22)
-    return rounds, -(-bits // rounds)
-
-
-def sort_keys(
-    keys: tuple[wp.array, wp.array],
-    order: tuple[wp.array, wp.array],
-    counts: wp.array,
-    rows: Rows,
-    pieces: int | Scalar,
-    bits: int,
-) -> None:
-    """Launch the sort of keys in place on the CPU, by a radix sort that is stable.
-
-    Args:
-        keys: int32, not negative, and scratch memory of the same size.
-        order: int32, which receives where each key was, and scratch memory.
-        counts: int32, scratch memory for `pieces` of a round's digits and `APART` more.
-        rows: rows of the keys, a piece a task.
-        pieces: how many there are.
-        bits: largest number of bits of a key.
-    """
-    device = counts.device
-    rounds, each = digits_of(bits)
-    (source_keys, sorted_keys), (moved_to, moved_from), before = keys, order[::-1], None
-    for shift in range(0, rounds * each, each):
-        digits = 1 << each
-        kernels.SORT_COUNT.bind(
-            rows, key=source_keys, counts=counts, digits=digits, shift=shift
-        ).launch()
-        kernels.SORT_BEGIN.bind(
-            Rows.entries(1, device), counts=counts, digits=digits, pieces=pieces
-        ).launch()
-        kernels.SORT_PLACE.bind(
-            rows,
-            key=source_keys,
-            order=before,
-            sorted=sorted_keys,
-            moved=moved_to,
-            counts=counts,
-            digits=digits,
-            shift=shift,
-        ).launch()
-        source_keys, sorted_keys, before, moved_to, moved_from = (
-            sorted_keys,
-            source_keys,
-            moved_to,
-            moved_from,
-            moved_to,
-        )
-
-
 def _check_shapes(position: np.ndarray, velocity: np.ndarray) -> None:
     if position.shape != (len(position), 3) or velocity.shape != position.shape:
         raise ValueError(
             f"position {position.shape} and velocity {velocity.shape}: must both be (n, 3)"
         )
-
-
-def lattice(
-    grid: StaggeredGrid, per_axis: int, jitter: float, random_seed: int, plane: int
-) -> np.ndarray:
-    """Return jittered lattice points in one plane of cells.
-
-    per_axis^dimension points per cell; the same in a part of a grid as in the whole.
-
-    Args:
-        grid: the grid; of a part one cell more on each side, from which points may be moved into
-            it.
-        per_axis: points along an edge of a cell.
-        jitter: width of the uniform random displacement, as a fraction of the points' spacing.
-        random_seed: seed of the displacements, which are one sequence over all of the grid.
-        plane: index of the cells along z, from 0; 0 in 2-D.
-
-    Returns:
-        Points [m], shape (n, 3), z = 0 in 2-D.
-    """
-    dimension, spacing = grid.dimension, grid.spacing / per_axis
-    site_counts = np.array(grid.domain_counts[:2]) * per_axis
-    low = np.maximum(np.array(grid.origin[:2]) - 1, 0) * per_axis
-    high = np.minimum((np.array(grid.origin[:2]) + grid.counts[:2] + 1) * per_axis, site_counts)
-    x, y = (np.arange(first, last) for first, last in zip(low, high, strict=True))
-    z = (
-        np.arange(plane * per_axis, (plane + 1) * per_axis)
-        if dimension == 3
-        else np.zeros(1, dtype=int)
-    )
-    moved = np.empty((len(z), len(y), len(x), dimension))
-    for number, layer in enumerate(z):
-        drawn = np.random.PCG64(random_seed)
-        # Skip the random numbers of the points before.
-        drawn.advance(int((layer * site_counts[1] + low[1]) * site_counts[0]) * dimension)
-        rows = np.random.Generator(drawn).random((len(y), site_counts[0], dimension))
-        moved[number] = rows[:, low[0] : high[0]]
-    Z, Y, X = np.meshgrid(
-        z + 0.5 if dimension == 3 else np.zeros(1), y + 0.5, x + 0.5, indexing="ij"
-    )
-    points = np.stack([X.ravel(), Y.ravel(), Z.ravel()], axis=1)
-    points[:, :dimension] += jitter * (moved.reshape(-1, dimension) - 0.5)
-    return points * spacing
-
-
-def seed(
-    grid: StaggeredGrid,
-    regions: typing.Sequence[typing.Callable[[np.ndarray], np.ndarray]],
-    open_cells: np.ndarray,
-    *,
-    per_axis: int,
-    jitter: float,
-    random_seed: int,
-    without: typing.Callable[[np.ndarray], np.ndarray] | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Fill regions with particles on a jittered lattice.
-
-    A point in several regions belongs to the first.
-
-    Args:
-        grid: the grid.
-        regions: functions of points [m], shape (n, 3), that return which lie in the region, shape
-            (n,).
-        open_cells: mask of the cells that may hold particles, shape (nz, ny, nx).
-        per_axis: points along an edge of a cell, >= 1.
-        jitter: width of the random displacement as a fraction of the points' spacing, 0 <= jitter
-            <= 1.
-        random_seed: seed of the displacements; they do not depend on the regions.
-        without: function of points [m], shape (n, 3), that returns which get no particle, shape
-            (n,).
-
-    Returns:
-        Positions [m], float32, shape (n, 3), and the region of each, shape (n,).
-
-    Raises:
-        ValueError: `per_axis` or `jitter` is out of range.
-    """
-    if per_axis < 1:
-        raise ValueError(f"per_axis = {per_axis}: must be at least 1")
-    if not 0.0 <= jitter <= 1.0:
-        raise ValueError(f"jitter = {jitter}: must be between 0 and 1")
-    axes, margin = slice(grid.dimension), MARGIN * grid.spacing
-    size, last = grid.extent, np.array(grid.domain_counts) - 1
-    positions, owners = [], []
-    for plane in range(grid.origin[2], grid.origin[2] + grid.counts[2]):
-        points = lattice(grid, per_axis, jitter, random_seed, plane).astype(np.float32)
-        np.clip(points[:, axes], margin, size[axes] - margin, out=points[:, axes])
-        cells = np.minimum((points.astype(np.float64) / grid.spacing).astype(int), last) - np.array(
-            grid.origin
-        )
-        if grid.whole is not None:
-            ours = ((cells >= 0) & (cells < np.array(grid.counts)))[:, :2].all(axis=1)
-            points, cells = points[ours], cells[ours]
-        free = open_cells[plane - grid.origin[2], cells[:, 1], cells[:, 0]]
-        points = points[free]
-        if without is not None:
-            points = points[~without(points)]
-        owner = np.full(len(points), -1)
-        for number, region in enumerate(regions):
-            if len(points):
-                owner[(owner < 0) & region(points)] = number
-        positions.append(points[owner >= 0])
-        owners.append(owner[owner >= 0])
-    return np.concatenate(positions), np.concatenate(owners)

@@ -329,17 +329,17 @@ class _RangeMemory:
         self.extent: tuple[int, ...] = (1, 1, 1)  # threads of a launch on CUDA now
         self.room: tuple[int, ...] = (1, 1, 1)  # largest dimensions so far
 
-    def take_dim(self, cells: CellRange, dim: tuple[int, int, int]) -> None:
+    def set_dim(self, cells: CellRange, dim: tuple[int, int, int]) -> None:
         """Set the CellRange on CUDA, with its threads."""
-        self.take(cells, dim[0] * dim[1] * dim[2])
+        self.set_cells(cells, dim[0] * dim[1] * dim[2])
         self.extent, self.room = dim, larger(self.room, dim)
 
-    def take(self, cells: CellRange, tasks: int) -> None:
+    def set_cells(self, cells: CellRange, tasks: int) -> None:
         """Set the CellRange."""
         ctypes.memmove(self.first[1], ctypes.addressof(_memory(cells)), self.first[2])
         self.tasks.value = tasks
 
-    def take_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
+    def set_box(self, rows: int, k: int, j: int, i: int, end: int, tasks: int) -> None:
         """Set a box of whole rows, see `CellRange`."""
         ctypes.memset(self.first[1], 0, self.first[2])
         BOX_OF_CELLS.pack_into(
@@ -411,25 +411,25 @@ class ActiveWindow(Window):
         if window.near is None:  # as `Rows.box` and `Window.cells` have it: a task takes a row
             some = int(end > i)
             for memory in self._rows:
-                memory.take_box(end - i, rows, planes, max(end - i, 1), some, window.low)
+                memory.set_box(end - i, rows, planes, max(end - i, 1), some, window.low)
             for of_cells in self._ranges:
-                of_cells.take_box(rows, k, j, i, end, planes * rows)
+                of_cells.set_box(rows, k, j, i, end, planes * rows)
             return
         for memory, rows_ in zip(self._rows, (window._shared, window._whole), strict=True):
-            memory.take(rows_.single)  # whose pieces have their own planes and rows
+            memory.set_layout(rows_.single)  # whose pieces have their own planes and rows
         for of_cells, pieces in zip(self._ranges, (window._pieces, window._hulls), strict=True):
-            of_cells.take(_in_part(pieces), len(pieces))
+            of_cells.set_cells(_in_part(pieces), len(pieces))
         self.hulls.point_to(window._hulls)
         self.pieces.value = len(window._hulls)
 
     def _move_on_device(self, window: Window) -> None:
         for memory, rows in zip(self._rows, (window._shared, window._whole), strict=True):
-            memory.take(rows.single, window.low)
+            memory.set_layout(rows.single, window.low)
         for planes, memory in self._sums.items():
-            memory.take(window.rows_of_sums(planes).summed, window.low)
+            memory.set_layout(window.rows_of_sums(planes).summed, window.low)
         whole = window._cells(max(window.high[2] - window.low[2], 1))
         for of_cells, cells in zip(self._ranges, (window.cells, whole), strict=True):
-            of_cells.take_dim(cells, (*window.rows, cells.chunks))
+            of_cells.set_dim(cells, (*window.rows, cells.chunks))
 
     def rows_of_sums(self, planes: int) -> Rows:
         """Return the rows of a pass that sums."""
@@ -440,7 +440,7 @@ class ActiveWindow(Window):
             memory = self._sums[planes] = DeviceRows()
             layers, rows_, chunks = self._ranges[0].room
             memory.room = -(-layers // planes), rows_, chunks
-            memory.take(rows.summed, self.low)
+            memory.set_layout(rows.summed, self.low)
         return replace(rows, memory=self._sums[planes])
 
     @property

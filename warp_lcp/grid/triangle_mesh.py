@@ -603,13 +603,13 @@ def _disagreeing(
         coo_array((np.ones(rows.size, dtype=bool), (rows, columns)), shape=(2 * m, 2 * m)),
         directed=False,
     )
-    kept, turned = label[:m], label[m:]
-    if (kept == turned).any():
+    unflipped, flipped = label[:m], label[m:]
+    if (unflipped == flipped).any():
         raise ValueError(
             f"{name}: the surface has one side only (like a Klein bottle), so inside and outside "
             "are undefined"
         )
-    group, bit = np.minimum(kept, turned), kept > turned
+    group, bit = np.minimum(unflipped, flipped), unflipped > flipped
     majority = 2 * np.bincount(group, weights=bit) > np.bincount(group)
     return bit ^ majority[group]
 

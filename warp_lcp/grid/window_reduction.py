@@ -37,7 +37,7 @@ class WindowReduction:
         self._shape, domain, self._declared = grid.shape[:2], grid.domain, declared
         self._planes = max(CUDA_PLANES, grid.size // CUDA_SUMS)
         self.name, self._counted = declared.name, counted
-        columns, device = len(declared.found), grid.device
+        columns, device = len(declared.reductions), grid.device
         self._tally = (
             DynamicReduction(declared, device, domain.rows_of_sums(self._planes).places)
             if device.is_cuda
@@ -94,7 +94,7 @@ class WindowReduction:
 
     def on_device(self) -> wp.array[wp.float64]:
         """Return the results on the device, a number a column."""
-        return self._reading.array if self._tally is None else self._tally.found
+        return self._reading.array if self._tally is None else self._tally.results
 
     def read(self) -> list[float]:
         """Return the results of the last launch."""

@@ -86,15 +86,15 @@ def pass_from_memory(form: KernelVariant) -> tuple[DataType, wp.Kernel]:
 
     if form.quads:
 
-        def from_memory(given: pieces):
-            P = given[0]
+        def from_memory(args: pieces):
+            P = args[0]
             q = task_of(P.L, wp.tid())
             run(P.L, P.F, q[0], q[1], q[2], 1)
     else:
 
-        def from_memory(given: pieces):
+        def from_memory(args: pieces):
             i, j, c = wp.tid()
-            P = given[0]
+            P = args[0]
             if i < (P.L.planes + P.L.slab - 1) // P.L.slab and j < P.L.rows and c < P.L.chunks:
                 run(P.L, P.F, i, j, c, 1)
 
@@ -214,7 +214,7 @@ class DeviceGraph(CommandBuffer):
         if extent is None or not sized:
             self._record_kernel(kernel, dim, inputs, (), 0, sized=0)
             return
-        room = self._hold(extent)
+        room = self._register_dimensions(extent)
         self._record_kernel(
             kernel, room[-len(dim) :], inputs, (first,) if first else (), sized, sized=len(dim)
         )
@@ -233,12 +233,14 @@ class DeviceGraph(CommandBuffer):
             return
         struct, kernel = pass_from_memory(bound.form)
         room = (
-            bound.form.dim(layout) if bound.rows.memory is None else self._hold(bound.rows.memory)
+            bound.form.dim(layout)
+            if bound.rows.memory is None
+            else self._register_dimensions(bound.rows.memory)
         )
         memory = bytes(native_of(layout)).ljust(LAYOUT_BYTES, b"\0") + bound.arguments
         self._add(kernel, struct, room, memory, patches, bound)
 
-    def _hold(self, memory: LaunchDimensions) -> tuple[int, ...]:
+    def _register_dimensions(self, memory: LaunchDimensions) -> tuple[int, ...]:
         """Return the launch dimensions for rows in memory.
 
         `fits` compares them with those of a later run.

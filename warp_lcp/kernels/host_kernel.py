@@ -73,7 +73,7 @@ class HostKernel(threading.local):
             field[:] = 0.0
         if tasks != self._tasks:
             self._tasks = tasks
-            self._rows.take(Rows.entries(tasks, self._device).single)
+            self._rows.set_layout(Rows.entries(tasks, self._device).single)
         self._graph.run()
         return self._reals, fields
 

@@ -205,7 +205,7 @@ class KernelVariant:
         switches |= {
             "BOUNDS": ord(self.bounds[0]),
             "STENCIL": stencil,
-            "FOUND": len(d.found),
+            "FOUND": len(d.reductions),
             "SUMS": len(d.sums),
         }
         macros = {n: v for n, v in constants.items() if isinstance(v, SupportsIndex)}
@@ -246,13 +246,13 @@ class KernelVariant:
                 "> L.n1 ? 1 : 2;"
             ]
             each += ["const int wide = L.fy == 1 || 2*P.j + 2 > L.n2 ? 1 : 2;"]
-        for n in (n for n in d.arrays if n not in d.box and not (d.found and n == "out")):
+        for n in (n for n in d.arrays if n not in d.box and not (d.reductions and n == "out")):
             pointer = f"given.{n}.data{at.get(n, '')}"
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
             each += [f"{'const ' * (n in d.reads)}auto* {n} = {pointer};"]
         each += [f"const auto {n} = given.{n};" for n in d.numbers]
         if d.box:
-            each += [f"double {n} = 0;" for n in d.found]
+            each += [f"double {n} = 0;" for n in d.reductions]
             each += [
                 f"const long long s2 = given.{next(iter(d.box))}.shape[2], s1 = "
                 f"s2*given.{next(iter(d.box))}.shape[1];"
@@ -300,7 +300,7 @@ class KernelVariant:
                 each += pattern.source()
         sums = [
             "#define EACH_FOUND(DO) "
-            f"{' '.join(f'DO({s}, {name})' for s, name in enumerate(d.found))}",
+            f"{' '.join(f'DO({s}, {name})' for s, name in enumerate(d.reductions))}",
             shared("piece.h", "sums"),
         ]
         sums += ["#undef EACH_FOUND"]
@@ -319,7 +319,7 @@ class KernelVariant:
         # In a block of its own, local names may be those of the declaration.
         body = ["{", text(d.header, d.declared), "}"] if d.box else [text(d.header, d.declared)]
         body += ["}"] * bool(d.listed)
-        body += ['#line 1 "sums"', *(sums if d.found else []), '#line 1 "end"', "}}}"]
+        body += ['#line 1 "sums"', *(sums if d.reductions else []), '#line 1 "end"', "}}}"]
         body = [*tasks, *common, *body]
         if d.box and not (d.listed or d.stencil or d.bounds):
             body = ["#ifdef __CUDA_ARCH__", *self._tasks_of_box(sums), "#else", *body, "#endif"]
@@ -340,12 +340,12 @@ class KernelVariant:
             pointer = f"given.{n}.data + offset_"
             pointer = f"given.{n}.data ? {pointer} : nullptr" if n in d.optional else pointer
             fields.append(f"auto* {n} = {pointer};")
-        whole = [n for n in d.arrays if n not in d.box and not (d.found and n == "out")]
+        whole = [n for n in d.arrays if n not in d.box and not (d.reductions and n == "out")]
         fields += [f"auto* {n} = given.{n}.data;" for n in whole]
         fields += [f"const auto {n} = given.{n};" for n in d.numbers if n not in PLACE]
-        fields += [f"double {n} = 0;" for n in d.found]
+        fields += [f"double {n} = 0;" for n in d.reductions]
         function = ['#line 1 "fields"', *fields, "{", text(d.header, d.declared), "}"]
-        function += ['#line 1 "sums"', *(sums if d.found else []), '#line 1 "end"', "}"]
+        function += ['#line 1 "sums"', *(sums if d.reductions else []), '#line 1 "end"', "}"]
         planes = ["long long offset_ = corner_; int at_ = begin_ * L.rows + row_;"]
         planes += ["for (int k_i = begin_; k_i < end_; ++k_i, at_ += L.rows, offset_ += s1) {"]
         planes += ["const Piece P = {n, k_i + plane_, j_, from_, at_, place_, k_i > begin_};"]
@@ -360,10 +360,10 @@ class KernelVariant:
         It is a loop over planes with the row function twice: for four cells and for fewer.
         """
         d = self.declared
-        found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.found))
+        found = " ".join(f"DO({s}, {name})" for s, name in enumerate(d.reductions))
         sums = (
             [f"#define EACH_FOUND(DO) {found}", shared("piece.h", "sums"), "#undef EACH_FOUND"]
-            if d.found
+            if d.reductions
             else []
         )
         common = [
@@ -388,13 +388,19 @@ class KernelVariant:
         whole = [
             line
             for half in self._halves()
-            for line in (*half, *self._fields_of_quad(type_of, kept=True), *function, "}", "else")
+            for line in (
+                *half,
+                *self._fields_of_quad(type_of, in_registers=True),
+                *function,
+                "}",
+                "else",
+            )
         ][:-1]
         rest = [
             "else if (FOUND || P.n > 0) {",
             "const int n = P.n;",
             POINTERS,
-            *self._fields_of_quad(type_of, kept=False),
+            *self._fields_of_quad(type_of, in_registers=False),
             *function,
             "}",
         ]
@@ -429,18 +435,18 @@ class KernelVariant:
             halves.append([*lines, f"const auto out_ = writing_({ours});"])
         return halves
 
-    def _fields_of_quad(self, type_of: Resolver, *, kept: bool) -> list[str]:
+    def _fields_of_quad(self, type_of: Resolver, *, in_registers: bool) -> list[str]:
         """Return C++ that declares the fields at a quad's first cell, by name.
 
-        `keep_alive`: they are held in registers, as `quad.h` does.
+        `in_registers`: hold them in registers, as `quad.h` does.
         """
         d = self.declared
         declarations = []
-        of_other = "in_other_" if kept else "in_"
+        of_other = "in_other_" if in_registers else "in_"
         reading = lambda other, data: f"{of_other}({data}, q)" if other else f"in_({data}, p)"  # noqa: E731
-        for n in (n for n in d.arrays if not (d.found and n == "out")):
+        for n in (n for n in d.arrays if not (d.reductions and n == "out")):
             if (
-                kept
+                in_registers
                 and self.types[n] in LOADED
                 and (n in d.reads or n in d.writes or (d.finer and n in d.other))
             ):

@@ -74,7 +74,7 @@ class ReadbackBuffer:
         self._host, self._end, self._changes, self._fetched = np.zeros(0, dtype=np.uint8), 0, 0, 0
         self._free: dict[int, list[int]] = {}  # free places by their size
 
-    def take(self, size: int) -> int | None:
+    def allocate(self, size: int) -> int | None:
         """Allocate so many bytes and return their place; None if there is no room."""
         size = -(-size // LINE) * LINE
         if free := self._free.get(size):
@@ -107,12 +107,12 @@ _boards: dict[str, ReadbackBuffer] = {}  # the newest buffer of each device
 def place_of(device: wp.Device, size: int) -> tuple[ReadbackBuffer, int]:
     """Return a buffer of a device with so many bytes free, and their place in it."""
     board = _boards.get(device.alias) or _boards.setdefault(device.alias, ReadbackBuffer(device))
-    place = board.take(size)
+    place = board.allocate(size)
     if place is None:
         gc.collect()  # frees readings that only reference cycles hold
-        place = board.take(size)
+        place = board.allocate(size)
     if place is None:  # the old buffer lives as long as its readings
         board = _boards[device.alias] = ReadbackBuffer(device, max(size, BYTES))
-        place = board.take(size)
+        place = board.allocate(size)
         assert place is not None
     return board, place

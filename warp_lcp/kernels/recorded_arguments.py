@@ -169,7 +169,7 @@ class RowsMemory:
         """Address of the number of tasks."""
         return ctypes.addressof(self.tasks)
 
-    def take_box(
+    def set_box(
         self, nx: int, rows: int, planes: int, grain: int, chunks: int, place: tuple[int, int, int]
     ) -> None:
         """Set the rows to whole rows of a box, see `RowLayout`."""
@@ -178,16 +178,16 @@ class RowsMemory:
         PLACE.pack_into(self.place, 0, *place)
         self.tasks.value = planes * rows * chunks
 
-    def take_entries(self, count: int, cells: int) -> int:
+    def set_entries(self, count: int, cells: int) -> int:
         """Set the rows to the entries of a list, on the CPU; return the tasks.
 
         The layout is that of `Rows.entries` with so many `cells` a task.
         """
         chunks = -(-count // cells)
-        self.take_box(count, 1, 1, cells, chunks, (0, 0, 0))
+        self.set_box(count, 1, 1, cells, chunks, (0, 0, 0))
         return chunks
 
-    def take(self, layout: RowLayout, place: tuple[int, ...] = (0, 0, 0)) -> None:
+    def set_layout(self, layout: RowLayout, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Set the rows.
 
         Args:
@@ -223,9 +223,9 @@ class DeviceRows(RowsMemory):
         self.room: tuple[int, ...] = (1, 1, 1)
         self.places, self.spare = Scalar(), spare
 
-    def take(self, layout: RowLayout, place: tuple[int, ...] = (0, 0, 0)) -> None:
+    def set_layout(self, layout: RowLayout, place: tuple[int, ...] = (0, 0, 0)) -> None:
         """Set the rows and their launch dimensions."""
-        super().take(layout, place)
+        super().set_layout(layout, place)
         self.extent = -(-layout.planes // max(layout.slab, 1)), layout.rows, layout.chunks
         self.room = larger(self.room, self.extent, self.spare)
         self.places.value = self.tasks.value

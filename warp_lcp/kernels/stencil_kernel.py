@@ -188,7 +188,7 @@ class StencilKernel:
             *fields,
             numbers,
             self.constants,
-            self.found and ("out", *(self.found if self.box else ())),
+            self.reductions and ("out", *(self.reductions if self.box else ())),
         )
         names = [name for group in groups for name in group]
         wrong = {
@@ -238,7 +238,7 @@ class StencilKernel:
         )
 
     @functools.cached_property
-    def found(self) -> tuple[str, ...]:
+    def reductions(self) -> tuple[str, ...]:
         """Names of the sums, then of the maxima."""
         return (*self.sums, *self.largest)
 
@@ -257,7 +257,7 @@ class StencilKernel:
 
         `out` receives the sums and maxima, a column each.
         """
-        out = {"out": wp.float64} if self.found else {}
+        out = {"out": wp.float64} if self.reductions else {}
         return {
             **self.reads,
             **self.writes,
@@ -494,20 +494,21 @@ class StencilKernel:
         for name, kind, value in pairs:
             if value is None and name in self.optional:
                 continue
-            found = value.dtype if isinstance(value, wp.array) else type(value)
-            expected = letters.setdefault(kind, found) if isinstance(kind, str) else kind
-            if not isinstance(value, wp.array) or found is not expected:
+            dtype = value.dtype if isinstance(value, wp.array) else type(value)
+            expected = letters.setdefault(kind, dtype) if isinstance(kind, str) else kind
+            if not isinstance(value, wp.array) or dtype is not expected:
                 why = f", as {seen[kind]}" if isinstance(kind, str) and kind in seen else ""
                 raise TypeError(
-                    f"{self.label}: {name} is {found.__name__}, not an array of "
+                    f"{self.label}: {name} is {dtype.__name__}, not an array of "
                     f"{expected.__name__}{why}"
                 )
             seen.setdefault(kind, name)
-        if others := [
-            f"{seen[kind]} is {found.__name__}" for kind, found in letters.items() if found not in C
+        if unsupported := [
+            f"{seen[kind]} is {dtype.__name__}" for kind, dtype in letters.items() if dtype not in C
         ]:
             raise TypeError(
-                f"{self.label}: {others[0]}: a letter stands for {', '.join(t.__name__ for t in C)}"
+                f"{self.label}: {unsupported[0]}: a letter stands for "
+                f"{', '.join(t.__name__ for t in C)}"
             )
         # Letters of absent arrays.
         return letters | dict.fromkeys(self.letters - letters.keys(), wp.float32)
@@ -525,7 +526,7 @@ class StencilKernel:
         )
         groups = (
             *sized,
-            (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.found))}),
+            (None, {**self.whole, **self.box, **dict.fromkeys(("out",) * bool(self.reductions))}),
         )
         return [(length, tuple(names)) for length, names in groups if names]
 
@@ -549,9 +550,10 @@ class StencilKernel:
                 rows,
                 {tuple(kernel_args[n].shape[-3:]) for n in self.box if kernel_args[n] is not None},
             )
-        if self.found and kernel_args["out"].size < len(self.found) * rows.places:
+        if self.reductions and kernel_args["out"].size < len(self.reductions) * rows.places:
             least = (
-                f"fewer than {len(self.found) * rows.places}: {rows.places} threads for each sum"
+                f"fewer than {len(self.reductions) * rows.places}: {rows.places} threads for each "
+                "sum"
             )
             raise ValueError(f"{self.label}: out has {kernel_args['out'].size} elements, {least}")
 
@@ -615,7 +617,7 @@ class BoundKernel(NamedTuple):
         """Layout of the rows, for a kernel that sums or one that does not."""
         return (
             self.rows.summed
-            if self.form.declared.found
+            if self.form.declared.reductions
             else self.rows.quads
             if self.form.quads
             else self.rows.single

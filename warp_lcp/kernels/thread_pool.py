@@ -222,7 +222,7 @@ class Operation:
         stages: list[OperationKind],
         chunks: int = 1,
         each: int = 0,
-        everything: int = 0,
+        total: int = 0,
         margin: int = 0,
         sized: int = 0,
     ) -> None:
@@ -233,15 +233,7 @@ class Operation:
         )
         self.check: Callable[[], object] | None = None
         self.condition, self.sized = 0, sized
-        self.words = (
-            kind,
-            self._stages.buffer_info()[0],
-            len(stages),
-            each,
-            everything,
-            margin,
-            chunks,
-        )
+        self.words = (kind, self._stages.buffer_info()[0], len(stages), each, total, margin, chunks)
 
     def content(self) -> tuple[Hashable, ...]:
         """Return the operation's content, without values read from memory in each run."""

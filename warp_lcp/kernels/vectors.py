@@ -344,7 +344,7 @@ class DynamicReduction:
     """
 
     def __init__(self, declared: StencilKernel, device: wp.Device, places: int = 0) -> None:
-        self._declared, self._columns = declared, len(declared.found)
+        self._declared, self._columns = declared, len(declared.reductions)
         self._reading = DeviceScalar(device, self._columns) if device.is_cuda else None
         self._partials = wp.empty(self._columns * places, dtype=wp.float64, device=device)
         self._between = wp.empty(
@@ -353,7 +353,7 @@ class DynamicReduction:
         self._places = 0
 
     @property
-    def found(self) -> DeviceArray | None:
+    def results(self) -> DeviceArray | None:
         """The results on a GPU, a number a column; None on the CPU."""
         return None if self._reading is None else self._reading.array
 

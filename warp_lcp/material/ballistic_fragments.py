@@ -195,7 +195,7 @@ class BallisticFragments:
         rows = max(ROOM * bodies, LEAST)
         self._who, self._body = (wp.zeros(most, dtype=wp.int32, device=device) for _ in range(2))
         flight.who, flight.body = self._who, self._body
-        self._list.take(0, {"who": self._who})
+        self._list.set_list(0, {"who": self._who})
         flight.sums = wp.zeros((rows, kernels.COLUMNS), dtype=wp.int64, device=device)
         self._vectors = np.zeros((rows, VECTORS, 3), dtype=np.float32)
         self._motion = wp.array(self._vectors, dtype=wp.vec3, device=device, copy=device.is_cuda)

@@ -37,7 +37,7 @@ def touch_of(separates: wp.uint8):
 @cell_kernel("warp_lcp.material.boundary")
 def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), planes: int, touch: U8):
     """Find the walls on the faces of each cell."""
-    found = int(0)
+    flags = int(0)
     for n in range(2 * planes + 2):
         side = 2 * (n & 1) - 1
         axis = n >> 1
@@ -47,8 +47,8 @@ def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), plan
             i + wp.where(axis == 0, side, 0),
         ]
         if wall >= 0:
-            found = found | touch_of(separating[wall])
-    touch[k, j, i] = wp.uint8(found)
+            flags = flags | touch_of(separating[wall])
+    touch[k, j, i] = wp.uint8(flags)
 
 
 @cell_kernel("warp_lcp.material.boundary")
@@ -56,19 +56,19 @@ def touch_cut_kernel(
     k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating: wp.array(dtype=wp.uint8), touch: U8
 ):
     """Find the walls on the faces of each cell; -1 marks an open face."""
-    found = int(0)
+    flags = int(0)
     for side in range(2):
         x = int(wx[k, j, i + side])
         if x >= 0:
-            found = found | touch_of(separating[x])
+            flags = flags | touch_of(separating[x])
         y = int(wy[k, j + side, i])
         if y >= 0:
-            found = found | touch_of(separating[y])
+            flags = flags | touch_of(separating[y])
         if planes == 2:
             z = int(wz[k + side, j, i])
             if z >= 0:
-                found = found | touch_of(separating[z])
-    touch[k, j, i] = wp.uint8(found)
+                flags = flags | touch_of(separating[z])
+    touch[k, j, i] = wp.uint8(flags)
 
 
 @cell_kernel("warp_lcp.material.boundary")

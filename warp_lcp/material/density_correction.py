@@ -25,7 +25,7 @@ from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
-from warp_lcp.problem.solve_loop import Solver
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.stopping import MeanCriteria
 from warp_lcp.settings import renamed_names
 
@@ -71,7 +71,7 @@ SHIFT = 1e-5
 class DensityMonitor:
     """Density monitor: fraction of the material in overfull cells.
 
-    `measure` and `found` are collective.
+    `measure` and `read_densities` are collective.
 
     Args:
         grid: the grid.
@@ -97,7 +97,7 @@ class DensityMonitor:
         self._measuring = LaunchGraph(grid.device, self._launch)
 
     def measure(self, density: wp.array | None, particles: Particles, window: Window) -> None:
-        """Measure the density; `found` then returns the result.
+        """Measure the density; `read_densities` then returns the result.
 
         Args:
             density: density of the particles, in units of that at rest, float32; computed here if
@@ -120,7 +120,7 @@ class DensityMonitor:
             self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density
         )
 
-    def found(self) -> tuple[float, float]:
+    def read_densities(self) -> tuple[float, float]:
         """Return the fraction of material above the limit, and the largest density.
 
         The density at rest is 1.

@@ -18,7 +18,8 @@ from warp_lcp.grid.barriers import BARRIER, Barriers
 from warp_lcp.grid.cut_cells import DEEP, CutCells
 from warp_lcp.grid.domain_sides import PeriodicSides, open_sides_of, periodic_sides, side_bits
 from warp_lcp.grid.grid_part import subdomain_of
-from warp_lcp.grid.particles import Particles, seed
+from warp_lcp.grid.particle_seeding import seed
+from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import SurfaceMesh, SurfaceObstacles
@@ -129,7 +130,7 @@ def make_bodies(
             )
     shapes = [placed[number - 1].geometry for number in motions]
     joints = scene.joints()
-    made = make(
+    rigid_bodies = make(
         bodies,
         shapes,
         list(motions),
@@ -137,8 +138,8 @@ def make_bodies(
         scene.dimension,
         **({"joints": joints} if joints else {}),
     )
-    made.exits = (scene.domain.size, side_bits(scene.domain.open))
-    return made
+    rigid_bodies.exits = (scene.domain.size, side_bits(scene.domain.open))
+    return rigid_bodies
 
 
 def make_boundary(
@@ -452,7 +453,7 @@ def make_sources(
     """
     if not scene.source:
         return None
-    kept = scene.kept(scene.source)
+    carried = scene.kept(scene.source)
     sources = [
         Source(
             name=f"source[{number}] ({source.shape})",
@@ -460,7 +461,7 @@ def make_sources(
             velocity=np.array(_vector(source.velocity)),
             start=source.begin,
             stop=np.inf if source.stop is None else source.stop,
-            kept=None if kept is None else kept[number],
+            kept=None if carried is None else carried[number],
         )
         for number, source in enumerate(scene.source)
     ]

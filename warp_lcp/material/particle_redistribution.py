@@ -107,7 +107,7 @@ class ParticleRedistribution:
     def max_density(self) -> float | None:
         """Return the largest density at the start of the step, if it was measured."""
         return (
-            self.density_monitor.found()[1]
+            self.density_monitor.read_densities()[1]
             if self.density_monitor is not None and self._looked
             else None
         )
@@ -202,7 +202,7 @@ class ParticleRedistribution:
             particles.arrange(step)
             particles.drop_ghosts()
             monitor.measure(None, particles, window)
-            if monitor.found()[0] <= self._severe:
+            if monitor.read_densities()[0] <= self._severe:
                 break
             done = correction.apply(particles, window, fill=fill, contact=contact)
             if done.result is None:
@@ -215,7 +215,7 @@ class ParticleRedistribution:
 
     def _parts(self, step: int) -> bool:
         if self.density_monitor is not None:
-            return self._looked and self.density_monitor.found()[0] > self._most
+            return self._looked and self.density_monitor.read_densities()[0] > self._most
         return self.correction is not None and step % self.correction.every == 0
 
     def _share(self, dt: float) -> float:
@@ -228,7 +228,7 @@ class ParticleRedistribution:
             return 1.0
         share = min(1.0, dt / self._pace)
         if math.isfinite(self._severe):
-            excess = self.density_monitor.found()[0]
+            excess = self.density_monitor.read_densities()[0]
             rest = min(max(excess / self._severe - 1.0, 0.0), 1.0)
             share += (1.0 - share) * rest
         return share

@@ -479,7 +479,7 @@ class ParticleSimulation(ParticleCheckpoints):
     ) -> None:
         self._continue(window, known, kind, contact, self._layer_filled())
         if self.sources is not None:
-            self.sources.hold(self.velocity, [])
+            self.sources.impose_velocity(self.velocity, [])
         self.grid.part.fill(*self.velocity)
 
     def _continue(
@@ -643,7 +643,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
         The density correction then needs no readback between the move and the correction.
         """
-        kept = (
+        count_changes = (
             self.grid.part.shared
             or self.band is not None
             or self.outlets is not None
@@ -651,7 +651,9 @@ class ParticleSimulation(ParticleCheckpoints):
             or self.spray.active
         )
         return (
-            self.grid.device.is_cuda and not kept and self.rearrangement.has_looked(self.step_count)
+            self.grid.device.is_cuda
+            and not count_changes
+            and self.rearrangement.has_looked(self.step_count)
         )
 
     def _everywhere(self) -> Window:

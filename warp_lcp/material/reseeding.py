@@ -128,7 +128,7 @@ class Reseeding:
         if not ranks.any(takers > 0):
             particles.drop_ghosts()
             return 0
-        self._list.take(takers, {"takers": self._takers})
+        self._list.set_list(takers, {"takers": self._takers})
         self._exchanging.run(particles)
         particles.drop_ghosts()
         return self._moved(before)

@@ -166,7 +166,7 @@ class Sources:
             self._running = running
         self._imposing.run(velocity, [], kind, True, variant=(velocity[0].ptr, 0, kind.ptr, True))
 
-    def hold(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
+    def impose_velocity(self, velocity: Faces, known: Faces, shown: wp.array | None = None) -> None:
         """Set the velocity of the running sources again.
 
         Of those that `supply` found.
@@ -201,17 +201,17 @@ class Sources:
         for number in running:
             start = self.sources[number].start
             starts = before is None or start > before + NOW
-            found = self._entered(
+            swept = self._entered(
                 number, min(max(since, start), now) if starts else since, now, starts=starts
             )
-            if len(found[-1]):
-                entered.append((number, found))
+            if len(swept[-1]):
+                entered.append((number, swept))
         if not entered and not self.grid.part.shared:  # ranks count together
             return 0
         held = self._occupants(particles) / self.per_axis**self.grid.dimension
         emitted = 0
-        for number, found in entered:
-            source, points = self.sources[number], self._new(held, *found)
+        for number, swept in entered:
+            source, points = self.sources[number], self._new(held, *swept)
             particles.append(
                 points,
                 np.broadcast_to(source.velocity.astype(np.float32), points.shape),
@@ -355,7 +355,7 @@ class Sources:
                     device=self.grid.device,
                 )
             self._memory = memory
-            self._lattice.take(count, self._points)
+            self._lattice.set_list(count, self._points)
             if self.grid.device.is_cpu:
                 self._found = [array.numpy() for array in self._points.values()]  # the same memory
         self._lattice.resize(count)

@@ -198,7 +198,7 @@ def coarsest_kernels(variable: bool, d_type: DataType, real: DataType) -> Simple
         other: square,
         inverse: square,
     ):
-        """Assemble and invert the matrix.
+        """Assemble the dense matrix A and compute A^-1; row by row, threads share the rows.
 
         Every thread of the block reaches every barrier.
         """

@@ -236,7 +236,7 @@ class Hierarchy:
             self.finest.mark_changes_kernel(self._signs).launch(program.launch)
         return program
 
-    def hold(self, d: DeviceArray, free: DeviceArray) -> None:
+    def mask_diagonal(self, d: DeviceArray, free: DeviceArray) -> None:
         """Set the finest diagonal for a free set: d where `free`, else 0.
 
         `free` is a stored uint8 field. Changed rows are marked.
@@ -358,7 +358,9 @@ class Hierarchy:
     def _coarser(self, fine: StencilLevel, *, bounded: bool) -> StencilLevel:
         """Return the next level: aggregates of two cells along some axes.
 
-        All axes are coarsened, or only the strong ones where axes differ much.
+        All axes are coarsened, or only the strong ones where axes differ much. The coarse operator
+        is Galerkin's P'A P with piecewise constant P: a coarse face's weight is the sum of
+        prod(factors) / factors[axis] finer ones, by which the mean strength of an axis grows.
         """
         s, counts = fine.stencil, fine.stencil.padding.counts
         total_counts = whole_counts(s)

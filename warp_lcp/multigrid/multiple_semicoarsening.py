@@ -173,7 +173,9 @@ def _long(stencil: PaddedStencil) -> list[int]:
 def _sampled(stencil: PaddedStencil) -> np.ndarray:
     """Return the mean logarithms of the weights along the long axes.
 
-    One row for each block that has open faces along all of them.
+    mean log w over the faces with w > 0 of a block, shape (blocks, axes). Smaller weights than
+    LEAST times the block's largest count as that. Only blocks of which half of the faces are open
+    along each of these axes have a row.
     """
     cells, long, device = stencil.padding.counts, _long(stencil), stencil.device
     dimension = max(len(long), 2)

@@ -296,7 +296,7 @@ class GridPoisson(GridOperator):
         twin.stencil = replace(s, d=copy_of(s.d), weights=weights, spans=twin._spans)
         return twin
 
-    def take(self, other: GridPoisson) -> None:
+    def copy_from(self, other: GridPoisson) -> None:
         """Copy an operator of the same form."""
         for to, source in zip(self._held(), other._held(), strict=True):
             overwrite(to, source)

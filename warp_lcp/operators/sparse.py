@@ -166,7 +166,7 @@ class SparseOperator(HostPickling):
         self._scale: np.ndarray | None = None
         self._turned: SparseOperator | None = None
         self._turned_from = 0
-        self._take(host)
+        self._survey_entries(host)
 
     def __reduce__(self) -> Reduced:
         """Pickle the current matrix."""
@@ -226,7 +226,7 @@ class SparseOperator(HostPickling):
             host = self._matrix_of(array)
         check_storable(host.data, self.dtype, "values")
         self.values.assign(host.data.astype(wp.dtype_to_numpy(self.dtype)))
-        self._take(host)
+        self._survey_entries(host)
 
     def apply(self, x: DeviceArray, out: DeviceArray | None = None) -> DeviceArray:
         """Return A x, x of shape (n,) and type wp.float32 or wp.float64."""
@@ -425,7 +425,7 @@ class SparseOperator(HostPickling):
         """Return the color of each row, shape (n,), from 0."""
         return greedy_colors(_ones(self._indptr, self._indices))
 
-    def _take(self, host: scipy.sparse.csr_array) -> None:
+    def _survey_entries(self, host: scipy.sparse.csr_array) -> None:
         """Update the data that depend on the entries."""
         largest, diagonal, same = _survey(host)
         self.symmetric = same or _is_symmetric(host, largest)

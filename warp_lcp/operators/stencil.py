@@ -506,7 +506,7 @@ class Stencil(GridOperator):
         ):
             structure = np.zeros((3, 3, 3), dtype=bool)  # of all neighbors that are coupled
             for offset in (
-                o for kept in self._pattern.offsets for o in (kept, CENTER, _opposite(kept))
+                o for stored in self._pattern.offsets for o in (stored, CENTER, _opposite(stored))
             ):
                 structure[tuple(step + 1 for step in offset[::-1])] = True
             number, count = scipy.ndimage.label(fluid, structure)
@@ -516,8 +516,8 @@ class Stencil(GridOperator):
             )
         matrix = grid_matrix(self)
         if len(places) < matrix.shape[0]:  # a principal system
-            kept = inside[self.cells.numpy().ravel() == FLUID]
-            matrix = matrix[kept][:, kept]
+            stored = inside[self.cells.numpy().ravel() == FLUID]
+            matrix = matrix[stored][:, stored]
         most = MOST_IN_SPACE if self.layout.padding.counts[0] > 1 else MOST_IN_PLANE
         vectors = null_vectors(
             matrix, rows[places], columns[places], most=most if self.monotone else 0
@@ -603,7 +603,7 @@ class StoredStencil(GridOperator):
         self._made, self._unit = (d, weights, pattern, strength), unit
         super().__init__(cells, {}, (), d.device, wp.float64 if d.dtype is wp.uint8 else d.dtype)
 
-    def take(self, cells: np.ndarray, d: np.ndarray, weights: DeviceArray) -> None:
+    def set_fields(self, cells: np.ndarray, d: np.ndarray, weights: DeviceArray) -> None:
         """Set other cells of the same shape, another diagonal, and weights, in place.
 
         `weights` has one field after another.

@@ -132,7 +132,7 @@ class Bounds:
         twin.fields, twin.code = [wp.clone(field) for field in self.fields], wp.clone(self.code)
         return twin
 
-    def take(self, other: Bounds) -> None:
+    def copy_from(self, other: Bounds) -> None:
         """Copy bounds of the same form."""
         for to, source in zip((*self.fields, self.code), (*other.fields, other.code), strict=True):
             overwrite(to, source)

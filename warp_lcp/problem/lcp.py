@@ -210,11 +210,11 @@ class LCP(HostPickling):
         twin.unknown = _unknown(twin.A, twin.layout)
         return twin
 
-    def take(self, other: LCP) -> None:
+    def copy_from(self, other: LCP) -> None:
         """Copy the data of a problem of the same form."""
         assert has(self.A, HasReplica), "its form exists"
-        self.A.take(other.A)
-        self.bounds.take(other.bounds)
+        self.A.copy_from(other.A)
+        self.bounds.copy_from(other.bounds)
         overwrite(self.b, other.b)
         for cached in ("lower", "upper"):
             self.__dict__.pop(cached, None)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from warp_lcp.operators.compressed_rows import CompressedRows
     from warp_lcp.operators.low_rank import LowRankOperator
     from warp_lcp.operators.padded_stencil import PaddedStencil
-    from warp_lcp.problem.solve_loop import Solver
+    from warp_lcp.problem.method_protocol import Solver
 
 AIR, FLUID, SOLID = 0, 1, 2  # types of a grid's cells
 FLOAT32_ROUNDING = 2.0**-24  # largest relative rounding of a number in float32
@@ -276,7 +276,7 @@ class HasReplica(Operator, Protocol):
     def replica(self) -> Operator:
         """Return a copy in its own memory."""
 
-    def take(self, other: Operator) -> None:
+    def copy_from(self, other: Operator) -> None:
         """Copy the data of an operator of the same form."""
 
 

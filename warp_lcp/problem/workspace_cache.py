@@ -12,8 +12,8 @@ from typing import Protocol
 
 from warp_lcp.kernels.thread_pool import get_threads, team
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Solver, Workspace
 from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import Solver, Workspace
 
 # Largest workspace that is kept, in cells with ghost cells: 45 bytes each, 140 in float64 with
 # fields of faces and bounds.
@@ -65,7 +65,7 @@ class WorkspaceCache:
         self.workspace: CachedWorkspace | None = None
         self.last: Hashable = None
 
-    def take(self, form: Hashable) -> tuple[CachedWorkspace | None, bool]:
+    def pop(self, form: Hashable) -> tuple[CachedWorkspace | None, bool]:
         """Remove and return the workspace of a form, None if another is kept.
 
         Also returns whether the last solve had the same form.
@@ -97,9 +97,9 @@ def cached_or_new_workspace(problem: LCP, solver: Solver) -> CachedWorkspace | N
     if form is None or team() is None:
         return None
     form = form, type(solver), solver, get_threads()
-    found, again = CACHE.take(form)
+    found, again = CACHE.pop(form)
     if found is not None:
-        found.work.problem.take(problem)
+        found.work.problem.copy_from(problem)
         return found
     return CachedWorkspace(form, solver.init(problem.replica())) if again else None
 

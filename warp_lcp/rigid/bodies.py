@@ -146,7 +146,7 @@ class RigidBodies:
         free = self._momenta()
         impulses = self._solve.push_apart(contacts, dt=dt, kick_dt=kick_dt)
         if self.material:
-            self._solve.hold(contacts, impulses)
+            self._solve.absorb_impulses(contacts, impulses)
         self.contact_residual, self.contact_iterations = (
             self._solve.residual,
             self._solve.iterations,
@@ -240,7 +240,7 @@ class RigidBodies:
             self.contact_residual,
         )
         state, holds, self.contacts, self.contact_residual = self._ranks.share(own_values)
-        self._take(state)
+        self._restore_state(state)
         for body, hold in zip(self.bodies, holds, strict=True):
             body.hold = hold
 
@@ -341,9 +341,9 @@ class RigidBodies:
                 f"{(len(self.bodies), STATE)}"
             )
         self._begun = None
-        self._take(state)
+        self._restore_state(state)
 
-    def _take(self, state: Mapping[str, np.ndarray]) -> None:
+    def _restore_state(self, state: Mapping[str, np.ndarray]) -> None:
         self._solve.memory.restore(state.get("body_contacts", np.zeros((0, 8))))
         self._solve.joint_impulses = np.array(
             state.get("joint_impulses", 0.0 * self._solve.joint_impulses), dtype=np.float64

@@ -113,7 +113,7 @@ class ContactNewton:
         self._friction = np.repeat(problem.friction, rows - 1)
         self._scale = np.concatenate([np.ones(self._J.shape[1]), 1.0 / np.sqrt(self._diagonal)])
         self.x, self.residual, self.steps = x.ravel(), np.inf, 0
-        self.take(self.x)
+        self.evaluate(self.x)
 
     def active_set(self, rtol: float) -> None:
         """Primal-dual active set method, starting from x.
@@ -145,7 +145,7 @@ class ContactNewton:
             if solution is None:
                 return
             x = solution
-            self.take(x)
+            self.evaluate(x)
 
     def interior_point(self, rtol: float) -> None:
         """Interior point method from several starts, until a residual is reached.
@@ -180,7 +180,7 @@ class ContactNewton:
         room = np.maximum(self._friction * x[self._own], slip / self._diagonal[self._tangents])
         now = _Pairs(x, np.full(len(self._normals), speed), slip, slip.copy(), room, room.copy())
         for _ in range(MOST_STEPS):
-            residual = self.take(now.x)
+            residual = self.evaluate(now.x)
             least, since = (residual, 0) if residual < least else (least, since + 1)
             if self.residual <= rtol or since == JAMMED:
                 return
@@ -286,7 +286,7 @@ class ContactNewton:
         low[self._tangents] = -up[self._tangents]
         return low, up
 
-    def take(self, x: np.ndarray) -> float:
+    def evaluate(self, x: np.ndarray) -> float:
         """Return the relative residual of x within its bounds; store x if it is best."""
         x = np.clip(x, *self._bounds(x))
         d = self._diagonal

@@ -214,7 +214,7 @@ class ContactProblem:
             swept = self.solve(
                 StoppingCriteria(rtol=rtol, max_iterations=MANY), newton.x.reshape(x.shape)
             )
-            newton.take(swept.impulses.ravel())
+            newton.evaluate(swept.impulses.ravel())
             newton.active_set(rtol)
             sweeps = swept.iterations
         return ContactImpulses(newton.x.reshape(x.shape), newton.residual, newton.steps + sweeps)

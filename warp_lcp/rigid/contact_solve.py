@@ -442,7 +442,7 @@ class ContactSolve:
     def store_impulses(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Store impulses, shape (k, dimension), as the start of the next step."""
         if self._pushed is not None and self._pushed.impulses is impulses:
-            self.memory.take(self._pushed.memory)
+            self.memory.store(self._pushed.memory)
         else:
             self.memory.keep(contacts, impulses, self.bodies)
 
@@ -499,7 +499,7 @@ class ContactSolve:
         apart = contacts.on_bodies(x[: gaps.size].reshape(gaps.shape), n)
         return self._answer(apart + (rows.jacobian(n).T @ x[gaps.size :]).reshape(n, -1))
 
-    def hold(self, contacts: Contacts, impulses: np.ndarray) -> None:
+    def absorb_impulses(self, contacts: Contacts, impulses: np.ndarray) -> None:
         """Let contacts with walls and solids absorb impulses into them.
 
         Each body is treated separately. A supported body supports the bodies in contact with it

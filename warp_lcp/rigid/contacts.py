@@ -107,11 +107,11 @@ class ContactMemory:
     def keep(self, contacts: Contacts, impulses: np.ndarray, bodies: BodyStates) -> None:
         """Store impulses, shape (k, dimension)."""
         world = (impulses[:, None] @ contacts.frames)[:, 0]
-        self.take(
+        self.store(
             np.column_stack([contacts.first, contacts.second, _places(contacts, bodies), world])
         )
 
-    def take(self, values: np.ndarray) -> None:
+    def store(self, values: np.ndarray) -> None:
         """Store values, shape (k, 8), up to the capacity."""
         self.values = values[: self._most]
 

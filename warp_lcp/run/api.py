@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 import warp as wp
 
-from warp_lcp.files.tables import TableView
+from warp_lcp.files import TableView
 from warp_lcp.frames.meshio_format import to_meshio
 from warp_lcp.grid.particles import Particles
 from warp_lcp.material.add_material import pour

@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.distributed.collective import Collective, on_root
+from warp_lcp.files import Tables, TableView
 from warp_lcp.files.archive import Archive, ArchiveError
 from warp_lcp.files.atomic import make_folder, replacing
-from warp_lcp.files.tables import Tables, TableView
 from warp_lcp.frames.pieces import in_ranks, rank_folder
 
 FORMAT = 2

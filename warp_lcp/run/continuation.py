@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 
-from warp_lcp.files.tables import TableView
+from warp_lcp.files import TableView
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import keys
 from warp_lcp.scene.shapes import BUILTIN

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.frames.frame_folder import frame_bytes
-from warp_lcp.grid.particles import lattice
+from warp_lcp.grid.particle_seeding import lattice
 from warp_lcp.grid.voxelize import inside
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation

@@ -19,6 +19,7 @@ from pydantic import TypeAdapter
 
 from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.distributed.watchdog import POST
+from warp_lcp.files import Tables
 from warp_lcp.files.atomic import (
     SPARE,
     SUFFIX,
@@ -29,7 +30,6 @@ from warp_lcp.files.atomic import (
     write_text,
 )
 from warp_lcp.files.size_limits import one_line
-from warp_lcp.files.tables import Tables
 from warp_lcp.frames.frame_folder import FRAME_FILE, FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import in_ranks, remove_empty_ranks
 from warp_lcp.run.checkpoint import (

@@ -11,9 +11,9 @@ from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+from warp_lcp.files import Tables
 from warp_lcp.files.atomic import open_in_place
 from warp_lcp.files.size_limits import one_line
-from warp_lcp.files.tables import Tables
 
 try:
     import fcntl

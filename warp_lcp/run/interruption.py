@@ -75,7 +75,7 @@ class Interruption:
         for number in self._signals:
             # None is a handler that Python has not installed and cannot restore.
             if signal.getsignal(number) not in (signal.SIG_IGN, None):
-                self._previous[number] = signal.signal(number, self._take)
+                self._previous[number] = signal.signal(number, self._handle_signal)
         return self
 
     def __exit__(
@@ -92,7 +92,7 @@ class Interruption:
         os.close(self._read)
         os.close(self._write)
 
-    def _take(self, signal_number: int, frame: FrameType | None) -> None:
+    def _handle_signal(self, signal_number: int, frame: FrameType | None) -> None:
         number = signal.Signals(signal_number)
         # SIGTERM may arrive several times, for the process and for its group.
         if number == signal.SIGINT:

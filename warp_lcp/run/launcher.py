@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from warp_lcp.files.tables import TableView
+from warp_lcp.files import TableView
 from warp_lcp.run.devices import choose_device
 from warp_lcp.run.folder import OutputError, RunRecord
 from warp_lcp.run.loop import RunRequest, run_scene

@@ -18,7 +18,7 @@ from warp_lcp.distributed import launch
 from warp_lcp.distributed.collective import Collective, RankFailed
 from warp_lcp.distributed.ranks import Ranks, device_of_rank
 from warp_lcp.distributed.watchdog import Watchdog
-from warp_lcp.files.tables import TableView
+from warp_lcp.files import TableView
 from warp_lcp.run.continuation import mesh_digests
 from warp_lcp.run.devices import DeviceError, EngineError, devices
 from warp_lcp.run.folder import OutputError, RunRecord, mark_ended

@@ -9,7 +9,7 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Literal, TypeVar
 
-from warp_lcp.files.tables import Tables, TableView
+from warp_lcp.files import Tables, TableView
 
 if TYPE_CHECKING:
     from warp_lcp.scene.scene import Scene

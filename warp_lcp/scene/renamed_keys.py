@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import get_args
 
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.scene.table import KeyFault, SceneError, Table
 
 

@@ -18,7 +18,7 @@ from pydantic_core import PydanticCustomError
 from warp_lcp.frames.meshio_format import FrameFormat
 from warp_lcp.grid.domain_sides import SIDES
 from warp_lcp.grid.voxelize import STRAY
-from warp_lcp.problem.solve_loop import PrecisionName
+from warp_lcp.problem.method_protocol import PrecisionName
 from warp_lcp.scene.camera import Camera
 from warp_lcp.scene.presets import PresetName, fill_in, preset_line
 from warp_lcp.scene.shapes import (

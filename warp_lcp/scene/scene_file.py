@@ -14,8 +14,8 @@ from typing import get_args, get_origin
 import numpy as np
 import tomli_w
 
+from warp_lcp.files import Tables, TableView
 from warp_lcp.files.atomic import write_text
-from warp_lcp.files.tables import Tables, TableView
 from warp_lcp.scene.renamed_keys import fix_text, rename_keys
 from warp_lcp.scene.scene import Scene, file_name
 from warp_lcp.scene.shapes import BUILTIN

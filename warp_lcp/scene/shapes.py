@@ -237,12 +237,12 @@ class CapsuleTable(Shape):
 
     def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the capsule in a scene of 2 or 3 dimensions."""
-        found = super().find_errors(dimension)
+        errors = super().find_errors(dimension)
         if self.start == self.end:
-            found.append(
+            errors.append(
                 CrossKeyError(("to",), self.end, 'must differ from "from"; use a sphere otherwise')
             )
-        return found
+        return errors
 
 
 class PlaneTable(Shape):
@@ -265,10 +265,10 @@ class PlaneTable(Shape):
 
     def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the plane in a scene of 2 or 3 dimensions."""
-        found = super().find_errors(dimension)
+        errors = super().find_errors(dimension)
         if not any(self.normal):
-            found.append(CrossKeyError(("normal",), self.normal, "must not be zero"))
-        return found
+            errors.append(CrossKeyError(("normal",), self.normal, "must not be zero"))
+        return errors
 
 
 class MeshTable(Shape):
@@ -394,12 +394,12 @@ class SolidProperties(Shape):
     def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the solid in a scene of 2 or 3 dimensions."""
         moves = self.motion.find_errors(dimension) if self.motion else []
-        found = super().find_errors(dimension) + [
+        errors = super().find_errors(dimension) + [
             CrossKeyError(("motion", *c.place), c.value, c.message) for c in moves
         ]
         if self.drag is not None and self.rubs:
-            found.append(CrossKeyError(("drag",), self.drag, "is for liquids; sand uses friction"))
-        return found + (self._body_errors() if self.is_body else self._still_errors())
+            errors.append(CrossKeyError(("drag",), self.drag, "is for liquids; sand uses friction"))
+        return errors + (self._body_errors() if self.is_body else self._still_errors())
 
     def _body_errors(self) -> list[CrossKeyError]:
         """Return errors of a rigid body."""
@@ -506,14 +506,14 @@ class SourceProperties(Schedule, Shape):
 
     def find_errors(self, dimension: int) -> list[CrossKeyError]:
         """Return errors of the source in a scene of 2 or 3 dimensions."""
-        found = super().find_errors(dimension) + self.schedule_errors()
+        errors = super().find_errors(dimension) + self.schedule_errors()
         if not any(self.velocity):
-            found.append(
+            errors.append(
                 CrossKeyError(
                     ("velocity",), self.velocity, "must not be zero: nothing would come out"
                 )
             )
-        return found
+        return errors
 
 
 class DrainProperties(Schedule, Shape):

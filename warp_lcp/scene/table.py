@@ -11,8 +11,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, InitErrorDetails, PydanticCustomError
 
+from warp_lcp.files import TableView
 from warp_lcp.files.size_limits import one_line
-from warp_lcp.files.tables import TableView
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError
 

@@ -13,8 +13,8 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import version_of
-from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.sweeps.spectrum import positive_diagonal, scaled_spectrum
 

@@ -13,8 +13,7 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.operator_protocol import HasStencil, check_taken, has
-from warp_lcp.problem.solve_loop import (
+from warp_lcp.problem.method_protocol import (
     Solver,
     Step,
     WorkspaceBase,
@@ -22,6 +21,7 @@ from warp_lcp.problem.solve_loop import (
     method_name,
     method_step,
 )
+from warp_lcp.problem.operator_protocol import HasStencil, check_taken, has
 from warp_lcp.settings import Settings
 
 

@@ -18,8 +18,8 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.compressed_rows import CompressedRows
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Solver, Step
 from warp_lcp.problem.operator_protocol import HasRows, HasStencil, check_taken, has
-from warp_lcp.problem.solve_loop import PrecisionName, Solver, Step
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace

@@ -12,9 +12,9 @@ from warp_lcp.kernels.fields import Array, checked_device, real_array
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.problem.data_types import Values
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.pickling import DataclassPickling
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.subproblems.dense_problem import (
     DenseProblem,
     DenseWorkspace,

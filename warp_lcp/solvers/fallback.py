@@ -13,17 +13,11 @@ import warp as wp
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.operator_protocol import MethodChain, declared, takes
-from warp_lcp.problem.pickling import Reduced
-from warp_lcp.problem.residual import EPS
-from warp_lcp.problem.result import SolveResult, SolveStatus
-from warp_lcp.problem.solve_loop import (
-    FLOOR_MARGIN,
+from warp_lcp.problem.method_protocol import (
     Precision,
     ReusableWorkspace,
     Solver,
     Step,
-    VariationalInequality,
     Workspace,
     WorkspaceDefaults,
     cached_workspace_of,
@@ -31,9 +25,13 @@ from warp_lcp.problem.solve_loop import (
     is_method,
     method_name,
     method_step,
-    refusal,
     takes_floating,
 )
+from warp_lcp.problem.operator_protocol import MethodChain, declared, takes
+from warp_lcp.problem.pickling import Reduced
+from warp_lcp.problem.residual import EPS
+from warp_lcp.problem.result import SolveResult, SolveStatus
+from warp_lcp.problem.solve_loop import FLOOR_MARGIN, VariationalInequality, refusal
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 
 WINDOW = 10  # steps over which the fall of the residual is measured
@@ -574,7 +572,7 @@ class FallbackWorkspace(WorkspaceDefaults):
         given = {"floating": self._floating} if takes_floating(work) else {}
         work.start(warm=not restart, tolerance=self._progress.tolerance, **given)
         if work is not self._first:
-            self._take(work)
+            self._copy_iterate(work)
             self.residual.evaluate(self.x)
         self._progress.record(self.residual.norm)
 
@@ -584,10 +582,10 @@ class FallbackWorkspace(WorkspaceDefaults):
         self._since += 1
         done = self._one_step(entry.method, work) if entry.batch == 1 else self._batch(entry, work)
         if work is not first:
-            self._take(work)
+            self._copy_iterate(work)
         return done
 
-    def _take(self, work: Workspace) -> None:
+    def _copy_iterate(self, work: Workspace) -> None:
         """Copy the iterate of the current method to x."""
         wp.copy(self.x, work.x)
         self._first.round_iterate()

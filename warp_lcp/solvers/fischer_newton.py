@@ -20,10 +20,10 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITY, without_far
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.residual_scaling import NoTranspose
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Precision, PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, CountOrZero, ShareOrAll, renamed
 from warp_lcp.solvers.gradient_descent import DescentWorkspace, GradientDescent
 from warp_lcp.subproblems.dense_problem import DenseWorkspace
@@ -39,7 +39,7 @@ from warp_lcp.subproblems.nonsmooth_map import (
     NonsmoothMap,
 )
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 SHARE = 0.95  # lambda of the penalized map for dense problems: measured on frictional contacts
 FIRST_STEPS = 30  # limit of the regularized stage: the solves that succeed need 5 to 27 steps
@@ -521,7 +521,17 @@ class FischerDenseWorkspace(DenseWorkspace):
     def _searched(
         self, x: np.ndarray, dx: np.ndarray, slope: float, merit: float, *, projected: bool
     ) -> SolveStatus | None:
-        """Search along a direction; return the failure, None if the merit falls."""
+        """Search along a direction; return the failure, None if the merit falls.
+
+        The merit is |f(x + t dx)|^2 / 2, at a point clipped to the bounds if `projected`.
+
+        Args:
+            x: the iterate, of the dense problem.
+            dx: the direction.
+            slope: of the merit along dx at t = 0; the search needs slope < 0.
+            merit: at t = 0.
+            projected: whether trial points are clipped.
+        """
         if not (np.isfinite(slope) and slope < 0):
             return SolveStatus.NON_DESCENT
         data, moved = self.map.data, x

@@ -14,9 +14,9 @@ import warp as wp
 
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step, WorkspaceBase
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Count, NonNegative, Settings, ShareOrAll, renamed
 from warp_lcp.subproblems.energy_monitor import NonmonotoneSearch
 from warp_lcp.subproblems.nonsmooth_map import MapForm, MapName, NonsmoothMap

@@ -14,9 +14,9 @@ from scipy.linalg.blas import dger
 from warp_lcp.deadline import time_is_up
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.settings import Count, Settings
 from warp_lcp.subproblems.dense_problem import (
     RANK,

@@ -28,14 +28,14 @@ from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step, WorkspaceBase
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.settings import Count, Positive, Share
 from warp_lcp.subproblems.equilibration import EquilibratedWorkspace
 from warp_lcp.subproblems.grid_system import GridSystem
 from warp_lcp.subproblems.multigrid_workspace import ColdStart
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 LARGEST_START = 1e6  # times the residual's norm: largest ||b|| that sets the size of the start
 
@@ -294,7 +294,9 @@ class InteriorPointWorkspace(WorkspaceBase):
         """Move x inside its bounds, and choose the multipliers.
 
         Far from the path their size follows from b and the residual, near it from the residual
-        alone: s and t are at least `least`, and so are w A_ii and v A_ii.
+        alone: s and t are at least `least`, and so are w A_ii and v A_ii [units of y]. With n
+        multipliers `least` = NEAR ||r|| / sqrt(n) near the path, else start max(||b||, ||r||) /
+        sqrt(unknowns), ||b|| limited to LARGEST_START ||r||. mu = (w's + v't) / n.
         """
         p = self.problem
         self._inside(x, 0.0)

@@ -20,9 +20,9 @@ from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.bounds import without_far
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.settings import Count, Settings
 from warp_lcp.subproblems.dense_problem import (
     DenseProblem,
@@ -270,9 +270,11 @@ class Basis:
         self.entering, self.ends = 2 * m, (2 * m, 2 * m)
 
     def pivot(self) -> bool | None:
-        """Pivot on the entering variable.
+        """Pivot on the entering variable of w = M z + q + d z0.
 
-        True when the path has ended, False on a ray, None to go on.
+        The leaving variable blocks its increase, by the minimum ratio test; its complement enters
+        next (Lemke's rule). True when z0 has left and the path has ended, False on a ray, None to
+        go on.
         """
         if self.entering < 0:  # the start is the solution
             return True
@@ -345,7 +347,9 @@ class Basis:
     def _leaving(self, direction: np.ndarray) -> int | None:
         """Return the row of the lexicographic minimum ratio, None on a ray.
 
-        z0 leaves whenever it may.
+        min values_i / direction_i over the rows with direction_i > 0; tied rows are compared by
+        their rows of B^-1 / direction_i, column by column, which excludes cycles. z0 leaves
+        whenever it may.
         """
         rows = np.flatnonzero(direction > PIVOT * np.abs(direction).max())
         if not len(rows):
@@ -408,7 +412,11 @@ class BandedBasis(Basis):
         return self._column() if self.missing < 0 else self.factors.solve(self._column())
 
     def _replace(self, direction: np.ndarray) -> None:
-        """Place the entering variable at its own pair, z0 at the leaving one's pair."""
+        """Place the entering variable at its own pair, z0 at the leaving one's pair.
+
+        The basic variables are then B^-1 q, with B factored for the new basis. When z0 leaves, they
+        are values - step direction with the ratio `step` of the leaving row.
+        """
         ended = self.variables[self.row] == 2 * self.m
         if self.missing >= 0:
             self.variables[self.missing] = self.entering
@@ -482,7 +490,7 @@ class LemkeWorkspace(DenseWorkspace):
         """Begin at z = 0 with the covering vector of ones."""
         super().start(warm=warm, tolerance=tolerance)
         self.rays, self._random, self._keeps_far = 0, np.random.default_rng(5381), False
-        self._take()
+        self._begin_scaled()
 
     def read(self) -> DenseProblem:
         """Copy the problem to the host; a narrow one stays sparse."""
@@ -494,9 +502,9 @@ class LemkeWorkspace(DenseWorkspace):
         The banded factors are singular, which the basis need not be.
         """
         self.data = super().read()
-        self._take()
+        self._begin_scaled()
 
-    def _take(self) -> None:
+    def _begin_scaled(self) -> None:
         """Scale the problem, and begin at z = 0 with the covering vector of ones."""
         scaled, self.units = self.data.scaled()
         lower, upper = without_far(scaled.lower, scaled.upper, BEYOND if self._keeps_far else FAR)
@@ -511,7 +519,7 @@ class LemkeWorkspace(DenseWorkspace):
                 self._widen()
             else:
                 self._keeps_far = True
-                self._take()
+                self._begin_scaled()
             return
         scaled = replace(scaled, lower=lower, upper=upper)
         self.form = LemkeForm.of(scaled)
@@ -558,9 +566,10 @@ class LemkeWorkspace(DenseWorkspace):
             start_game(self.basis)
 
     def _finish(self, z: np.ndarray) -> None:
-        """Write the solution, polished where x is between its bounds.
+        """Write x = clip(units x(z), l, u), polished where it is between its bounds.
 
-        If x is no solution, a pivot was noise: the path counts as a ray.
+        Polishing takes two Newton steps for y = 0 on these unknowns. If x is no solution, a pivot
+        was noise: the path counts as a ray.
         """
         data = self.data
         x = np.clip(self.units * self.form.solution(z), data.lower, data.upper)
@@ -586,6 +595,6 @@ class LemkeWorkspace(DenseWorkspace):
             return
         if self._has_far and not self._keeps_far:  # a solution may lie beyond the omitted bounds
             self.rays, self._keeps_far = 0, True
-            self._take()
+            self._begin_scaled()
             return
         self.ended = SolveStatus.INFEASIBLE if inconsistent(self.data) else SolveStatus.STAGNATED

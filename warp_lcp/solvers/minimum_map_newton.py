@@ -13,10 +13,9 @@ from typing import ClassVar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve_loop import Step, WorkspaceDefaults
+from warp_lcp.problem.method_protocol import Step, WorkspaceDefaults
 from warp_lcp.settings import Count, CountOrZero
-from warp_lcp.subproblems.reduced_system import ReducedSystem, reduced_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings, ReducedSystem, reduced_system
 
 DECREASE = 1e-4  # share of a step by which the residual must fall
 

@@ -22,10 +22,16 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import (
+    Precision,
+    PrecisionName,
+    Step,
+    Workspace,
+    WorkspaceBase,
+)
 from warp_lcp.problem.operator_protocol import HasStencil, has
 from warp_lcp.problem.residual import NaturalResidual
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Precision, PrecisionName, Step, Workspace, WorkspaceBase
 from warp_lcp.settings import Count, CountOrZero, Positive, Settings
 from warp_lcp.subproblems import grid_step_kernels as engine
 from warp_lcp.subproblems.active_set_kernels import projected_move
@@ -460,9 +466,10 @@ class MPRGPWorkspace(WorkspaceBase):
         return True
 
     def _projected_step(self, direction: DeviceArray, gain: float, curvature: float) -> bool:
-        """Move x to the energy's minimum along a direction, projected.
+        """Move x to the energy's minimum along a direction p, projected.
 
-        The step is halved where the projection raises the energy.
+        x <- clip(x + t p, l, u) with t = gain / curvature: the energy's decrease per length of p,
+        and p'A p. The step is halved where the projection raises the energy x'A x / 2 + b'x.
         """
         residual = self.residual
         if curvature > 0:

@@ -16,9 +16,9 @@ from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step
 from warp_lcp.problem.operator_protocol import HasRows, HasSweep, check_taken
 from warp_lcp.problem.residual import WITHIN
-from warp_lcp.problem.solve_loop import PrecisionName, Step
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.solvers.psor import DIRECTIONS, Direction, SweepWorkspace
 from warp_lcp.sweeps.sweep import sweep_for

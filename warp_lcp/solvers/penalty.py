@@ -18,13 +18,13 @@ from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.multigrid.black_box_multigrid import takes_points
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step, WorkspaceBase
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.settings import Positive, Share
 from warp_lcp.subproblems.active_set_kernels import ON_FREE
 from warp_lcp.subproblems.multigrid_workspace import ColdStart
 from warp_lcp.subproblems.principal_system import principal_system
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/penalty.h")
 MOVE = KERNELS["penalty.move"]

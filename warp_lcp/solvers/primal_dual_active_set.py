@@ -18,15 +18,15 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.problem.bounds import INFINITE, Bounds
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.operator_protocol import HasRows, HasScale, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.settings import Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton, NewtonWorkspace
 from warp_lcp.subproblems.active_set_kernels import projected_move
 from warp_lcp.subproblems.correction_system import CorrectionSystem
 from warp_lcp.subproblems.dense_problem import DenseProblem, pivots_of
-from warp_lcp.subproblems.settings import NewtonSettings
+from warp_lcp.subproblems.reduced_system import NewtonSettings
 
 LOWER, FREE, UPPER = -1, 0, 1  # places of an unknown in least-index pivoting
 STUCK = 2  # steps on one set that do not reduce the residual: its free block is singular
@@ -200,7 +200,9 @@ class ActiveSetWorkspace(NewtonWorkspace):
     def least_index_step(self, x: DeviceArray) -> Step:
         """Take least-index pivots: the first violating unknown changes its place.
 
-        The step is interim until no condition is violated.
+        An unknown's place is l, u, or F for free: y_F = 0, x = l or u elsewhere. It is violated by
+        x_F beyond a bound, by y < 0 at l and y > 0 at u. On a P-matrix the sequence is finite. The
+        step is interim until no condition is violated.
         """
         problem = DenseProblem.read(self.problem)
         data, units = problem.scaled()

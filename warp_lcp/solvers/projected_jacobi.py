@@ -9,8 +9,8 @@ import warp as wp
 
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step
 from warp_lcp.problem.operator_protocol import version_of
-from warp_lcp.problem.solve_loop import PrecisionName, Step
 from warp_lcp.settings import Positive, Settings
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.sweeps.spectrum import scaled_spectrum

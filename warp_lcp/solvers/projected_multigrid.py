@@ -12,9 +12,9 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.sum import grid_and_low_rank
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step
 from warp_lcp.problem.operator_protocol import HasLowRankTerm, HasStencil, check_taken, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import PrecisionName, Step
 from warp_lcp.problem.workspace_cache import CachedWorkspace, cached_or_new_workspace
 from warp_lcp.settings import Count, CountOrZero, Settings
 from warp_lcp.subproblems.multigrid_coupled import CoupledWorkspace

@@ -19,7 +19,7 @@ from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import Reduction, rows_of
 from warp_lcp.problem.frictional_contact import FrictionalContact
-from warp_lcp.problem.solve_loop import Precision, Step
+from warp_lcp.problem.method_protocol import Precision, Step
 from warp_lcp.settings import Count, Settings, Share
 
 f64, i32 = wp.float64, wp.int32

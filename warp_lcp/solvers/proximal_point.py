@@ -15,12 +15,7 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.data_types import Matrix, is_sparse
 from warp_lcp.problem.lcp import LCP, as_operator
-from warp_lcp.problem.operator_protocol import HasRows, HasScale, check_taken, has
-from warp_lcp.problem.residual import EPS
-from warp_lcp.problem.residual_scaling import scale_of_matrix
-from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import (
-    FLOOR_MARGIN,
+from warp_lcp.problem.method_protocol import (
     Solver,
     Step,
     Workspace,
@@ -28,6 +23,11 @@ from warp_lcp.problem.solve_loop import (
     evaluate_unless_current,
     method_step,
 )
+from warp_lcp.problem.operator_protocol import HasRows, HasScale, check_taken, has
+from warp_lcp.problem.residual import EPS
+from warp_lcp.problem.residual_scaling import scale_of_matrix
+from warp_lcp.problem.result import SolveStatus
+from warp_lcp.problem.solve_loop import FLOOR_MARGIN
 from warp_lcp.settings import Settings
 from warp_lcp.solvers.fallback import Fallback, fails
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton

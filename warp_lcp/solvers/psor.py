@@ -11,6 +11,7 @@ import numpy as np
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import (
     HasRows,
     HasStencil,
@@ -19,7 +20,6 @@ from warp_lcp.problem.operator_protocol import (
     has,
     version_of,
 )
-from warp_lcp.problem.solve_loop import PrecisionName, Step, WorkspaceBase
 from warp_lcp.settings import Relaxation, Settings
 from warp_lcp.sweeps.spectrum import scaled_spectrum
 from warp_lcp.sweeps.sweep import Contraction, Diagonal, OrderName, Sweep, SweepOrder, sweep_for

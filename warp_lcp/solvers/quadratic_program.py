@@ -13,8 +13,8 @@ import scipy.sparse.linalg
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step
 from warp_lcp.settings import Count, Positive, Settings
 from warp_lcp.subproblems.dense_problem import (
     SEMIDEFINITE,

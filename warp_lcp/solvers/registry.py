@@ -15,8 +15,8 @@ from __future__ import annotations
 from inspect import signature
 from typing import Any
 
+from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.operator_protocol import declared, families
-from warp_lcp.problem.solve_loop import Solver
 from warp_lcp.settings import nearest
 from warp_lcp.solvers.accelerated_projected_gradient import AcceleratedProjectedGradient
 from warp_lcp.solvers.blocked_gauss_seidel import BlockedGaussSeidel

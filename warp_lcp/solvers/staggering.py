@@ -24,6 +24,7 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID
 from warp_lcp.operators.sparse import SparseOperator, greedy_colors
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.method_protocol import Solver, Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import (
     HasRestriction,
     HasRows,
@@ -33,7 +34,7 @@ from warp_lcp.problem.operator_protocol import (
     version_of,
 )
 from warp_lcp.problem.result import SolveResult
-from warp_lcp.problem.solve_loop import Solver, Step, WorkspaceBase, solve
+from warp_lcp.problem.solve_loop import solve
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.settings import Count, Settings, Share
 from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton

@@ -20,8 +20,8 @@ from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import PrecisionName, Step
 from warp_lcp.problem.operator_protocol import HasRows, HasSweep, check_taken
-from warp_lcp.problem.solve_loop import PrecisionName, Step
 from warp_lcp.settings import Count, Relaxation, Settings, Share
 from warp_lcp.solvers.psor import SweepWorkspace
 from warp_lcp.subproblems.active_set_kernels import ON_FREE, projected_move

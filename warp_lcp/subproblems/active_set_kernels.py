@@ -28,13 +28,13 @@ def projected_move(
     *,
     z: DeviceArray | None = None,
     beta: float = 0.0,
-    kept: DeviceArray | None = None,
+    saved_x: DeviceArray | None = None,
     guarded: bool = True,
 ) -> None:
     """Set `to` = clip(x + length along, l, u) where the direction is not 0.
 
-    With `z`, the direction z + beta along first replaces `along`. `kept` receives x. If `guarded`,
-    an x whose step is not finite stays unchanged. See `reduced_systems.h`.
+    With `z`, the direction z + beta along first replaces `along`. `saved_x` receives x. If
+    `guarded`, an x whose step is not finite stays unchanged. See `reduced_systems.h`.
     """
     STEP.bind(
         rows,
@@ -43,7 +43,7 @@ def projected_move(
         z=z,
         along=along,
         to=to,
-        kept=kept,
+        saved_x=saved_x,
         beta=beta,
         step=length,
         guarded=guarded,

@@ -186,7 +186,7 @@ class CoarseStencilProblem(FullApproximationCorrection):
         cells = np.where(inside.reshape(coarse.padding.shape)[1, 1:-1, 1:-1], FLUID, AIR)
         d = np.where(inside, coarse.d.numpy(), 0)
         if self._work is not None:
-            self._work.problem.A.take(cells, d, coarse.weights)
+            self._work.problem.A.set_fields(cells, d, coarse.weights)
             return True
         copied, n = wp.clone(coarse.weights), coarse.padding.size
         weights = tuple(copied[i * n : (i + 1) * n] for i in range(8))

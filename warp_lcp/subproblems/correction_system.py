@@ -17,9 +17,9 @@ from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import HasStencil, has
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase
 from warp_lcp.subproblems.active_set_kernels import CLASSIFY, ON_FREE, projected_move
 from warp_lcp.subproblems.coarse_problem import CoarseStencilProblem, FullApproximationCorrection
 from warp_lcp.subproblems.dense_system import DampedSteps, DenseSystem
@@ -222,7 +222,7 @@ class CorrectionSystem:
             x if whole else self.start_of_step,
             self.principal.e,
             length * self.size,
-            kept=self.start_of_step if whole else None,
+            saved_base=self.start_of_step if whole else None,
         )
         self.settle()
         return self.iterate.residual.evaluate(x)
@@ -277,11 +277,11 @@ class CorrectionSystem:
         return Step(name, iterations, self.active, failure, interim=self._shrinks)
 
     def _set(
-        self, base: DeviceArray, e: DeviceArray, scale: float, kept: DeviceArray | None = None
+        self, base: DeviceArray, e: DeviceArray, scale: float, saved_base: DeviceArray | None = None
     ) -> None:
         """Set x = clip(base + scale e), rounded, where e is not 0.
 
-        If `kept` is given, it receives base.
+        If `saved_base` is given, it receives base.
         """
         projected_move(
             self.sums.rows,
@@ -290,7 +290,7 @@ class CorrectionSystem:
             e,
             scale,
             self.iterate.x,
-            kept=kept,
+            saved_x=saved_base,
             guarded=False,
         )
         self.iterate.round_iterate()

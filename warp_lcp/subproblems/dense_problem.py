@@ -19,12 +19,12 @@ from warp_lcp.deadline import check_time, seconds_left
 from warp_lcp.problem.data_types import Matrix, SparseMatrix, is_sparse
 from warp_lcp.problem.data_types import dense as as_dense
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import HasRows, has
 from warp_lcp.problem.program_optimality import PROVABLE
 from warp_lcp.problem.residual import EPS
 from warp_lcp.problem.residual_scaling import scale_of_matrix, scaled, sizes_of_matrix
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Precision, Step, WorkspaceBase
 
 # Shift with which an equilibrated semi-definite matrix must have a Cholesky factor.
 SEMIDEFINITE = 1e-10

@@ -50,7 +50,10 @@ class DenseSystem:
         return float(np.linalg.norm(self.r.numpy()))
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
-        """Factor the free block and solve; the tolerance is not used."""
+        """Factor the free block and solve (A_FF + D) e_F = r_F; the tolerance is not used.
+
+        D is the shift's diagonal, 0 without one. Returns 1 and the norm of (A_FF + D) e_F - r_F.
+        """
         free, r, e = self._free, self.r.numpy(), np.zeros(self.e.size)
         norm = 0.0
         if free.size:

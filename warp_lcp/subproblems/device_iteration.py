@@ -33,8 +33,8 @@ from warp_lcp.kernels.vectors import CONVERT, sum_over_ranks
 from warp_lcp.multigrid.cycle_passes import CLEAR
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.grid_poisson import GridPoisson
+from warp_lcp.problem.method_protocol import Precision
 from warp_lcp.problem.operator_protocol import Scratch
-from warp_lcp.problem.solve_loop import Precision
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.subproblems.energy_monitor import CREEP, STALL
 from warp_lcp.subproblems.grid_step_kernels import (
@@ -115,7 +115,9 @@ def keep_row_kernel(scalars: f64, rows: f64, n: int):
 
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
 @no_type_check
-def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others: f64, unusual: f64):
+def join_unusual_kernel(
+    floating: wp.array(dtype=wp.int32), faults: f64, other_bounds: f64, unusual: f64
+):
     """Join the flags of an unusual start, so that ranks exchange them together.
 
     Floating components, faults of the guess, and bounds of another code.
@@ -123,8 +125,8 @@ def join_unusual_kernel(floating: wp.array(dtype=wp.int32), faults: f64, others:
     unusual[0] = wp.float64(floating[0])
     unusual[1] = faults[0]
     unusual[2] = wp.float64(0.0)
-    if others:
-        unusual[2] = others[0]
+    if other_bounds:
+        unusual[2] = other_bounds[0]
 
 
 @forward_kernel(module="warp_lcp.projected_multigrid.ahead")
@@ -227,6 +229,9 @@ def judge_kernel(
     It goes on if the residual and, with bounds, the energy are the least so far, the tolerance is
     missed, and the free set does not creep. The free set must not change either, unless the device
     rebuilds what depends on it; `calm`: whether that is sufficient.
+
+    norm = sqrt(sum r^2), energy E = x'A x / 2 + b'x; E has fallen if E_lowest - E > noise
+    (|E_last| + |E|). SAFELY widens the limits, so that the host decides all close cases.
     """
     zero = wp.float64(0.0)
     n = int(judged[TAKEN])

@@ -68,9 +68,9 @@ class EnergyMonitor:
         return self._norm, self._least, self._energy, self._lowest, self._fell
 
     def record(self, energy: float, norm: float) -> float:
-        """Record the end of a step; return the decrease of the energy.
+        """Record the end of a step; return the decrease E_last - E of the energy.
 
-        Returns 0 if the decrease is within rounding.
+        Returns 0 if the decrease is within rounding: noise (|E_last| + |E|).
         """
         fell, left = self._energy - energy, norm / self._norm if self._norm > 0 else 0.0
         # Changes of the energy below `margin` may be rounding.

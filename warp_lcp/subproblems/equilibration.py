@@ -21,10 +21,10 @@ from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.data_types import Matrix
 from warp_lcp.problem.lcp import LCP, as_operator
+from warp_lcp.problem.method_protocol import Step, Workspace, WorkspaceBase
 from warp_lcp.problem.operator_protocol import HasRows, HasScale, has, version_of
 from warp_lcp.problem.residual_scaling import scaled
 from warp_lcp.problem.result import SolveStatus
-from warp_lcp.problem.solve_loop import Step, Workspace, WorkspaceBase
 from warp_lcp.subproblems.dense_problem import (
     DenseProblem,
     power_of_two,

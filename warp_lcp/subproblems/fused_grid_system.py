@@ -16,8 +16,8 @@ from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.multigrid.hierarchy import Hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, Step
 from warp_lcp.problem.operator_protocol import HasStencil
-from warp_lcp.problem.solve_loop import Precision, Step
 from warp_lcp.problem.stopping import StoppingCriteria
 from warp_lcp.subproblems import grid_step_kernels as engine
 from warp_lcp.subproblems.multigrid_workspace import MultigridWorkspace
@@ -53,7 +53,7 @@ class MinimumMapResidual(ResidualAndActiveSet):
         found, comm = bool(self._away.numpy().any()), self.problem.layout.comm
         return found if comm is None else comm.any(found)
 
-    def hold(self, x: DeviceArray) -> None:
+    def project_held(self, x: DeviceArray) -> None:
         """Move held unknowns onto their bounds, and update the right-hand side.
 
         Only in flagged rows and those beside them: g = -(A x + b) / size on the free set.
@@ -150,7 +150,7 @@ class FusedGridSystem:
         assert isinstance(residual, MinimumMapResidual)
         if residual.away:
             passes.store_best()
-            residual.hold(passes.x)
+            residual.project_held(passes.x)
         return True
 
     def solve(self) -> int:

@@ -82,7 +82,7 @@ class GridSystem(GuardedSystem):
         if self._weight is None:
             if shift is not None:
                 raise ValueError("shift: construct the system with shifted=True")
-            self.hierarchy.hold(source.d, free)
+            self.hierarchy.mask_diagonal(source.d, free)
             self.hierarchy.rebuild_changed()
         else:
             rows, weight = rows_of(target), self._weight

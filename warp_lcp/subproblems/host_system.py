@@ -19,9 +19,9 @@ from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.operators.dense import DenseOperator
 from warp_lcp.operators.sparse import SparseOperator
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import Operator
 from warp_lcp.problem.residual import NaturalResidual
-from warp_lcp.problem.solve_loop import Precision, Step, WorkspaceBase
 from warp_lcp.subproblems.correction_system import CorrectionSystem
 from warp_lcp.subproblems.dense_problem import factored
 from warp_lcp.subproblems.nested_iteration import nested_iteration

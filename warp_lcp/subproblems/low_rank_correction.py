@@ -41,8 +41,8 @@ I32, F64 = wp.array(dtype=wp.int32), wp.array(dtype=wp.float64)
 
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
-def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, kept: F64):
-    """Split Z'r: e = E^-1 Z'r into `kept`, f = S'^-1 Z'r into `force`.
+def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, coarse: F64):
+    """Split Z'r: e = E^-1 Z'r into `coarse`, f = S'^-1 Z'r into `force`.
 
     `force` has a factor for each column of U. S and E are the inverses, row by row.
     """
@@ -53,18 +53,18 @@ def split_kernel(S: F64, E: F64, columns: I32, sums: F64, m: int, force: F64, ke
         f += S[j * m + i] * sums[j]
         e += E[i * m + j] * sums[j]
     force[columns[i]] = f
-    kept[i] = e
+    coarse[i] = e
 
 
 @no_type_check
 @forward_kernel(module="warp_lcp.low_rank_correction")
-def join_kernel(S: F64, columns: I32, u: F64, m: int, kept: F64, t: F64):
-    """Compute t = S^-1 U'z - kept, with `kept` of `split_kernel`.
+def join_kernel(S: F64, columns: I32, u: F64, m: int, coarse: F64, t: F64):
+    """Compute t = S^-1 U'z - coarse, with `coarse` of `split_kernel`.
 
     S is the inverse, row by row.
     """
     i = wp.tid()
-    a = -kept[i]
+    a = -coarse[i]
     for j in range(m):
         a += S[i * m + j] * u[columns[j]]
     t[i] = a
@@ -272,7 +272,7 @@ class WoodburyCorrection:
         inputs = [low.weights, squares, low.rank, columns.width, self._power, self.calm]
         launch(calm_kernel, 1, inputs, device=low.device)
 
-    def renew(self, *, begins: bool, noted: bool = False, made: bool = False) -> bool:
+    def renew(self, *, begins: bool, noted: bool = False, has_potentials: bool = False) -> bool:
         """Choose the columns to correct for the current free set, and update potentials.
 
         A potential Z_q = B U_q costs a cycle.
@@ -281,7 +281,7 @@ class WoodburyCorrection:
             begins: whether a solve begins.
             noted: whether `note` has been launched for this free set, `note_products` too, and
                 their readings have changed since.
-            made: whether `make_potentials` has been launched.
+            has_potentials: whether `make_potentials` has been launched.
 
         Returns:
             Whether the finest right-hand side was overwritten.
@@ -291,9 +291,9 @@ class WoodburyCorrection:
             self.prepare()
             self._squaring.run(variant=self._columns.rows.ptr)
             self.noted.changed()
-        found, width, comm = self.noted.numpy().copy(), self._columns.width, low.layout.comm
-        found = found if comm is None else comm.sum(found)
-        squares, rows = found[: low.rank], np.repeat(found[low.rank :], width)
+        reduced, width, comm = self.noted.numpy().copy(), self._columns.width, low.layout.comm
+        reduced = reduced if comm is None else comm.sum(reduced)
+        squares, rows = reduced[: low.rank], np.repeat(reduced[low.rank :], width)
         # Ratio of added to own inertia of column q: W_qq U_q'A^-1 U_q, estimated from the rows that
         # it touches.
         strong = np.flatnonzero(
@@ -306,15 +306,15 @@ class WoodburyCorrection:
             self._choose(strong)
         seen, now = self._seen.tolist(), squares.tolist()
         stale = [q for q in strong if not seen[q] / CHANGED <= now[q] <= seen[q] * CHANGED]
-        made = made and begins and not slots_changed
-        if made:
+        has_potentials = has_potentials and begins and not slots_changed
+        if has_potentials:
             self._seen[stale] = squares[stale]
         else:
             self._fill(stale, squares)
         overwritten, products_known = (
             bool(stale),
             self._read_products is not None
-            and (made or (noted and not begins and not slots_changed and not stale)),
+            and (has_potentials or (noted and not begins and not slots_changed and not stale)),
         )
         if strong and not self._invert(W, known=products_known) and len(stale) < len(strong):
             self._fill([q for q in strong if q not in stale], squares)

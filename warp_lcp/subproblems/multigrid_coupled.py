@@ -176,9 +176,17 @@ class CoupledWorkspace(MultigridWorkspace):
             return
         begins, self._fresh = self._fresh, False
         noted, self.free_set_noted = self.free_set_noted, False
-        made, self._prepared = self._prepared, False  # this has overwritten the right-hand side
+        has_potentials, self._prepared = (
+            self._prepared,
+            False,
+        )  # this has overwritten the right-hand side
         # `renew` may have overwritten it too.
-        if self.correction.renew(begins=begins, noted=noted, made=noted and made) or made:
+        if (
+            self.correction.renew(
+                begins=begins, noted=noted, has_potentials=noted and has_potentials
+            )
+            or has_potentials
+        ):
             self._evaluation.run(self.x, classify, variant=self.problem_key())
             if self.floating is not None:
                 self._project()

@@ -24,8 +24,8 @@ from warp_lcp.multigrid.halo_levels import beside_cuts
 from warp_lcp.multigrid.multiple_semicoarsening import make_hierarchy
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
+from warp_lcp.problem.method_protocol import Precision, Step, WorkspaceBase
 from warp_lcp.problem.operator_protocol import HasStencil
-from warp_lcp.problem.solve_loop import Precision, Step, WorkspaceBase
 from warp_lcp.problem.stopping import MeanCriteria, StoppingCriteria
 from warp_lcp.subproblems import grid_step_kernels as kernels
 from warp_lcp.subproblems.device_iteration import DeviceIteration

@@ -130,6 +130,9 @@ class BlockTridiagonalProblem:
     def solved(self, x: np.ndarray) -> np.ndarray:
         """Return x after whole Newton steps, until the active set stays or recurs.
 
+        Held are the unknowns with x - y / d beyond a bound, d = diag A; the others solve
+        A_FF e_F = -y_F (primal-dual active set).
+
         Raises:
             np.linalg.LinAlgError: a free block is singular, or the matrix has a diagonal entry that
             is not positive.

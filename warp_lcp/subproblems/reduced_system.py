@@ -1,20 +1,45 @@
-"""Reduced systems of Newton's method on the minimum map: protocol and choice."""
+"""Reduced systems of Newton's method on the minimum map: protocol, choice, shared settings."""
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol
 
 from warp_lcp.multigrid.black_box_multigrid import takes_points
+from warp_lcp.multigrid.cycle_settings import CycleSettings
 from warp_lcp.operators.components import FloatingComponents
 from warp_lcp.problem.lcp import LCP
-from warp_lcp.problem.solve_loop import Step, WorkspaceBase
+from warp_lcp.problem.method_protocol import PrecisionName, Step, WorkspaceBase
+from warp_lcp.settings import Count, CountOrZero, Settings, Share
 from warp_lcp.subproblems.correction_system import CorrectionSystem
 from warp_lcp.subproblems.fused_grid_system import FusedGridSystem
 from warp_lcp.subproblems.host_system import HostSystem
 
 if TYPE_CHECKING:
     from warp_lcp.solvers.minimum_map_newton import MinimumMapNewton
+
+
+@dataclass(frozen=True, kw_only=True)
+class NewtonSettings(Settings):
+    """Settings of methods that solve a linear system in each step.
+
+    A method that needs other defaults declares the field again.
+
+    Args:
+        precision: "mixed": iterate float64, corrections float32 on grids; "double"; or "single":
+            the iterate rounded to float32 too.
+        monotone_cycles: projected multigrid cycles of a cold start on a grid.
+        eta: each linear solve reduces its residual by this factor.
+        max_linear_iterations: maximum number of iterations of one linear solve.
+        cycle: settings of multigrid cycles.
+    """
+
+    precision: PrecisionName = "mixed"
+    monotone_cycles: CountOrZero = 2
+    eta: Share = 0.1
+    max_linear_iterations: Count = 200
+    cycle: CycleSettings = field(default_factory=CycleSettings)
 
 
 class ReducedSystem(Protocol):

@@ -82,7 +82,10 @@ def positive_diagonal(problem: LCP) -> np.ndarray:
 def _lanczos(
     product: Callable[[np.ndarray], np.ndarray], v: np.ndarray, steps: int
 ) -> tuple[float, float]:
-    """Return the extreme Ritz values of a symmetric map after some Lanczos steps.
+    """Return the extreme Ritz values of a symmetric map A after some Lanczos steps.
+
+    beta_k v_{k+1} = A v_k - alpha_k v_k - beta_{k-1} v_{k-1} with alpha_k = v_k'A v_k, |v_k| = 1;
+    Ritz values are the eigenvalues of tridiag(beta, alpha, beta).
 
     Plain three-term recurrence without reorthogonalization: ghost eigenvalues do not change the
     extreme ones. It stops where the Krylov space is exhausted.

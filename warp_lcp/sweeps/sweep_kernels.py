@@ -96,6 +96,8 @@ def row_kernels(a_type: DataType) -> SimpleNamespace:
     ):
         """Relax the rows of `order` one after the other, by one thread.
 
+        x_i <- clip(x_i - omega y_i / A_ii, l_i, u_i) with y = A x + b of the current x.
+
         An empty `order` means all rows, by number.
         """
         for place in range(n):

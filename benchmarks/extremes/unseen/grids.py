@@ -8,7 +8,7 @@ import scipy.ndimage
 from warp_lcp import gallery
 from warp_lcp.benchmarks.extremes.problem import GridProblem, faces_of, with_solution
 from warp_lcp.benchmarks.extremes.unseen.draw import AIR, FLUID, SOLID, SeededGenerator, framed
-from warp_lcp.files.tables import Tables, TableValue
+from warp_lcp.files import Tables, TableValue
 
 
 def some_bounds(draw: SeededGenerator, shape: tuple[int, ...]) -> Tables:
@@ -187,12 +187,12 @@ def dam(draw: SeededGenerator) -> GridProblem:
     ny = max(5, int(nx * draw.between(0.6, 2)))
     width, high = draw.between(8, 32), draw.between(16, 32)
     flat = high * (nx - 1) / width / (ny - 1)
-    made = gallery.dam(
+    problem = gallery.dam(
         nx, ny, width=width, high=high, low=high * draw.between(0, 0.6), device="cpu"
     )
     return GridProblem(
         cells=framed(np.ones((ny - 2, nx - 2))),
-        b=made.b,
+        b=problem.b,
         faces={"face_x": flat, "face_y": 1 / flat},
     )
 

@@ -31,7 +31,7 @@ from warp_lcp.benchmarks.extremes.case import (
 )
 from warp_lcp.benchmarks.extremes.problem import GridProblem, Problem, equality
 from warp_lcp.benchmarks.harness.record import RecordTable
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.gradients.names import SolveOptions
 from warp_lcp.problem.operator_protocol import families
 

@@ -70,7 +70,7 @@ class WorldBodies(RigidBodies):
     ) -> np.ndarray:
         """Return the inputs of a step of dt [s]: poses, and velocities after forces.
 
-        Arguments as of `take`.
+        Arguments as of `set_state`.
         """
         placed, moved = (array[self.indices].astype(np.float64) for array in (poses, velocities))
         given = (
@@ -84,7 +84,7 @@ class WorldBodies(RigidBodies):
             v[3:] += rotation @ body.properties.inverse_inertia @ rotation.T @ impulse[3:]
         return np.concatenate([placed, moved], axis=1)
 
-    def take(
+    def set_state(
         self, poses: np.ndarray, velocities: np.ndarray, forces: np.ndarray | None, time: float
     ) -> bool:
         """Set the state of the world; return whether a body was moved from outside.
@@ -122,7 +122,7 @@ class WorldBodies(RigidBodies):
         return moved
 
     def give(self, poses: np.ndarray, velocities: np.ndarray) -> None:
-        """Write the state of the free bodies into arrays as of `take` (updated)."""
+        """Write the state of the free bodies into arrays as of `set_state` (updated)."""
         for number, index in enumerate(self.indices):
             if not self.prescribed[number]:
                 body = self.bodies[number]

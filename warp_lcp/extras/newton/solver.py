@@ -168,7 +168,7 @@ class SolverLiquid(SolverBase, CouplingInterface):
         forces = None if state_in.body_f is None else state_in.body_f.numpy()
         asked = bodies.requested_state(poses, velocities, forces, dt)
         if self._begin(asked, dt):
-            if bodies.take(poses, velocities, forces, simulation.time):
+            if bodies.set_state(poses, velocities, forces, simulation.time):
                 simulation.boundary.place(simulation.time)
             self._advance(dt)
         poses, velocities = poses.copy(), velocities.copy()

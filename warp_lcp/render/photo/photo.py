@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.files import Tables
 from warp_lcp.files.atomic import make_folder, replacing
-from warp_lcp.files.tables import Tables
 from warp_lcp.render.film import Film, film_suffix
 from warp_lcp.render.photo.mitsuba_renderer import (
     VERSION,

@@ -50,11 +50,11 @@ SIMD for (int k = 0; k < n; ++k) {
 
 // kernel active_set.step: `along` = z + beta `along` if z is given; `to` = x + step `along`,
 // clipped to the bounds where `along` is not 0. With `guarded`, x stays where the step is not
-// finite. `kept` receives x.
+// finite. `saved_x` receives x.
 //   compute    float64
 //   bounds
 //   reads      float64 x?; S z?
-//   writes     S along; float64 to?, kept?
+//   writes     S along; float64 to?, saved_x?
 //   numbers    float64 beta, step; bool guarded
 const S part = (S)beta;
 const bool fresh = part == 0, open = !guarded;
@@ -63,7 +63,7 @@ if (z && (to || fresh))
     SIMD for (int k = 0; k < n; ++k) along[k] = fresh ? z[k] : z[k] + part * along[k];
 else if (z)
     SIMD for (int k = 0; k < n; ++k) along[k] = z[k] + part * along[k];  // one rounding
-if (kept) SIMD8 for (int k = 0; k < n; ++k) kept[k] = x[k];
+if (saved_x) SIMD8 for (int k = 0; k < n; ++k) saved_x[k] = x[k];
 if (to)
     with_bounds([&](auto lower, auto upper) {
         SIMD8 for (int k = 0; k < n; ++k) {
