@@ -34,7 +34,7 @@ import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine_code import Kernel, assemble, tools_missing
-from benchmarks.machine_counts import IssuedInstructions, issued
+from benchmarks.machine_counts import KINDS, IssuedInstructions, issued
 from benchmarks.machine_memory import EmulatedMemory, constants_of
 from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.kernels import StencilKernel, layout
@@ -332,3 +332,13 @@ def table(counts: Iterable[InstructionCount], n: int) -> Iterator[str]:
             limit = max(limits, key=lambda name: limits[name])
             cells += [f"{limits[limit]:.3f}", limit]
         yield f"| `{one.name}` | {' | '.join(cells)} |"
+
+
+def kinds_table(counts: Iterable[InstructionCount]) -> Iterator[str]:
+    """Yield the lines of a table of kernels: issued instructions a cell by their kinds."""
+    names = (*KINDS, "index")
+    yield f"| pass | all | {' | '.join(names)} |"
+    yield "|---" * (2 + len(names)) + "|"
+    for one in counts:
+        cells = [f"{one.issued.kinds[name] / one.cells:.1f}" for name in names]
+        yield f"| `{one.name}` | {one.a_cell:.1f} | {' | '.join(cells)} |"
