@@ -291,7 +291,8 @@ def _compiled(form: KernelVariant, folder: Path) -> Kernel:
     """Return a kernel compiled for sm_90."""
     kernel, place = form.kernel, folder / form.kernel.module.name
     if not place.exists():
-        kernel.module.options["block_dim"] = BLOCK
+        # As on a GPU; the emulation compiles kernels for the CPU without optimization.
+        kernel.module.options |= {"block_dim": BLOCK, "optimization_level": 3}
         wp.compile_aot_module(
             kernel.module.name, device=None, arch=[90], module_dir=place, use_ptx=True
         )
