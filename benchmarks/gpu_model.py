@@ -414,10 +414,12 @@ def heard(
         mock.patch.object(PersistentKernel, "launch", sequencing),
         mock.patch.object(wp, "launch", launch),
         mock.patch.object(wp.Launch, "launch", replaying),
-        *(mock.patch.object(context, name, invoking(name)) for name in invokes),
     )
+    invokers = [mock.patch.object(context, name, invoking(name)) for name in invokes]
     for patch in patches:
         patch.start()
+    for one in invokers:
+        one.start()
     work = make()
     work()
     for kept in (recorded.bytes, recorded.graph, recorded.names, recorded.keys, recorded.cells):
@@ -426,6 +428,8 @@ def heard(
     emulated_cuda.meter.clear()
     counting = True
     work()
+    for one in invokers:
+        one.stop()
     for patch in reversed(patches):
         patch.stop()
     recorded.readbacks = emulated_cuda.meter["readbacks"]
