@@ -34,7 +34,7 @@ import warp as wp
 
 import warp_lcp as wl
 from benchmarks.machine_code import Kernel, assemble, tools_missing
-from benchmarks.machine_counts import IssuedInstructions, issued
+from benchmarks.machine_counts import KINDS, IssuedInstructions, issued
 from benchmarks.machine_memory import EmulatedMemory, constants_of
 from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.kernels import StencilKernel, layout
@@ -291,7 +291,8 @@ def _compiled(form: KernelVariant, folder: Path) -> Kernel:
     """Return a kernel compiled for sm_90."""
     kernel, place = form.kernel, folder / form.kernel.module.name
     if not place.exists():
-        kernel.module.options["block_dim"] = BLOCK
+        # As on a GPU; the emulation compiles kernels for the CPU without optimization.
+        kernel.module.options |= {"block_dim": BLOCK, "optimization_level": 3}
         wp.compile_aot_module(
             kernel.module.name, device=None, arch=[90], module_dir=place, use_ptx=True
         )
@@ -332,3 +333,13 @@ def table(counts: Iterable[InstructionCount], n: int) -> Iterator[str]:
             limit = max(limits, key=lambda name: limits[name])
             cells += [f"{limits[limit]:.3f}", limit]
         yield f"| `{one.name}` | {' | '.join(cells)} |"
+
+
+def kinds_table(counts: Iterable[InstructionCount]) -> Iterator[str]:
+    """Yield the lines of a table of kernels: issued instructions a cell by their kinds."""
+    names = (*KINDS, "index")
+    yield f"| pass | all | {' | '.join(names)} |"
+    yield "|---" * (2 + len(names)) + "|"
+    for one in counts:
+        cells = [f"{one.issued.kinds[name] / one.cells:.1f}" for name in names]
+        yield f"| `{one.name}` | {one.a_cell:.1f} | {' | '.join(cells)} |"

@@ -103,7 +103,8 @@ class LaunchCounter:
         if module.name not in self._modules:
             place = self._folder / module.name
             options = dict(module.options)
-            module.options["block_dim"] = BLOCK
+            # As on a GPU; the emulation compiles kernels for the CPU without optimization.
+            module.options |= {"block_dim": BLOCK, "optimization_level": 3}
             wp.compile_aot_module(
                 module.name, device=None, arch=[90], module_dir=place, use_ptx=True
             )

@@ -13,13 +13,14 @@ with a cell a thread: launches of 4.5 to 8 us and stages of 4 to 1 us fit within
 is the latency of a small kernel. A stage issues a third of the instructions since threads take four
 cells: 1.2 us by its counts. Nothing that is newer than those solves has been measured on a GPU.
 
-With --sass, the kernels' machine code is counted instead: see `benchmarks/gpu_counts.py`.
+With --sass, the kernels' machine code is counted instead: see `benchmarks/gpu_counts.py`. With
+--readbacks, launches and readbacks of a step are counted: see `benchmarks/gpu_readbacks.py`.
 """
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from benchmarks import emulated_cuda, gpu_counts  # must precede the package
+from benchmarks import emulated_cuda, gpu_counts, gpu_readbacks  # must precede the package
 from warp_lcp.files import Tables
 from warp_lcp.kernels import Rows
 from warp_lcp.kernels.launch_graph import Launch
@@ -29,6 +30,7 @@ from warp_lcp.operators.padded_stencil import PaddedStencil
 # ruff: isort: split
 
 import argparse
+import ctypes
 import math
 import tempfile
 from collections import Counter
@@ -36,11 +38,12 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unittest import mock
 
 import numpy as np
 import warp as wp
+from numpy.ctypeslib import as_array
 from warp._src import context
 
 import warp_lcp as wl
@@ -51,6 +54,7 @@ from warp_lcp.grid import staggered
 from warp_lcp.kernels import StencilKernel, layout
 from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
+from warp_lcp.kernels.vectors import add_up_kernel
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -265,6 +269,25 @@ def name_of(kernel: wp.Kernel) -> str:
     return f"{kernel.module.name.removeprefix('warp_lcp.')}:{kernel.key}"
 
 
+def add_up_at_once(params: list[Any]) -> None:
+    """Compute what a launch of `add_up_kernel` computes, up to the order of the sums.
+
+    The emulation runs its threads as fibers, which takes most of the time of a step of sand.
+
+    Args:
+        params: launch bounds and arguments, as Warp passes them.
+    """
+    partials, before, n, threads, segments, out, slot = params[1:]
+    count, step = n.value, threads.value * segments.value
+    columns = params[0].size // step
+    values = as_array((ctypes.c_double * partials.shape[0]).from_address(partials.data))
+    taken = np.zeros((columns, -(-count // step) * step))
+    taken[:, :count] = values[before.value * count :][: columns * count].reshape(columns, count)
+    sums = taken.reshape(columns, -1, segments.value, threads.value).sum(axis=(1, 3)).reshape(-1)
+    results = as_array((ctypes.c_double * out.shape[0]).from_address(out.data))
+    results[slot.value : slot.value + sums.size] = sums
+
+
 def heard(
     make: Callable[[], Callable[[], object]], counter: LaunchCounter | None = None
 ) -> RecordedWork:
@@ -286,7 +309,7 @@ def heard(
     invokes = {name: getattr(context, name) for name in ("invoke", "invoke_cpu_blocks")}
     current: list[LaunchWork] = []
     active: list[LaunchWork] = []
-    recorded = RecordedWork()
+    recorded, counting = RecordedWork(), False
 
     def binding(
         declared: StencilKernel,
@@ -374,11 +397,14 @@ def heard(
         recorded.across += launched.across
 
     def invoking(name: str) -> Callable[[object, object, list[object], bool], None]:
-        def invoke(kernel: object, hooks: object, params: list[object], adjoint: bool) -> None:
-            if counter is not None and active and not active[-1].stages:
+        def invoke(kernel: wp.Kernel, hooks: object, params: list[Any], adjoint: bool) -> None:
+            if counting and counter is not None and active and not active[-1].stages:
                 last = active[-1]
                 counter.count(last.key, kernel, params, last.cells)
-            invokes[name](kernel, hooks, params, adjoint)
+            if kernel.key == add_up_kernel.key:
+                add_up_at_once(params)
+            else:
+                invokes[name](kernel, hooks, params, adjoint)
 
         return invoke
 
@@ -389,19 +415,20 @@ def heard(
         mock.patch.object(wp, "launch", launch),
         mock.patch.object(wp.Launch, "launch", replaying),
     )
+    invokers = [mock.patch.object(context, name, invoking(name)) for name in invokes]
     for patch in patches:
         patch.start()
+    for one in invokers:
+        one.start()
     work = make()
     work()
     for kept in (recorded.bytes, recorded.graph, recorded.names, recorded.keys, recorded.cells):
         kept.clear()
     recorded.stages = recorded.across = 0
     emulated_cuda.meter.clear()
-    counting = [mock.patch.object(context, name, invoking(name)) for name in invokes]
-    for one in counting if counter is not None else ():
-        one.start()
+    counting = True
     work()
-    for one in counting if counter is not None else ():
+    for one in invokers:
         one.stop()
     for patch in reversed(patches):
         patch.stop()
@@ -587,9 +614,30 @@ def main() -> None:
         action="store_true",
         help="of --sass: steps of a liquid and of sand instead of passes",
     )
+    parser.add_argument(
+        "--kinds",
+        nargs="*",
+        metavar="PASS",
+        help="issued instructions of passes by their kinds, or of those that begin like this",
+    )
+    parser.add_argument(
+        "--readbacks",
+        nargs="*",
+        metavar="SCENE",
+        help="launches and readbacks of a step of these scenes, or of all; 20 minutes",
+    )
     told = "without --sass: solves as on GPUs with clusters of blocks (capability 9.0 on)"
     parser.add_argument("--clusters", action="store_true", help=told)
     options = parser.parse_args()
+    if options.readbacks is not None:
+        for line in gpu_readbacks.table(options.readbacks):
+            print(line, flush=True)
+        return
+    if options.kinds is not None:
+        words = tuple(options.kinds) or gpu_counts.AREAS
+        for line in gpu_counts.kinds_table(gpu_counts.counts(words)):
+            print(line, flush=True)
+        return
     if options.sass and options.steps:
         print("Steps: counted for sm_90; times of a step [us] on an H200, as predicted")
         print_steps([options.step_cells] if options.step_cells else STEP_SIZES)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from benchmarks.machine_code import Instruction
 from benchmarks.machine_memory import EmulatedMemory
@@ -18,6 +18,18 @@ from benchmarks.machine_thread import Lane, decoded
 FLOAT64 = frozenset(("DADD", "DMUL", "DFMA", "DSETP", "DMNMX"))
 ATOMIC = frozenset(("RED", "REDG", "ATOM", "ATOMG"))
 LOCAL = frozenset(("LDL", "STL"))
+# Kinds of instructions, by the names of these; the rest are integers: indices and their tests.
+KINDS = {
+    "float": "FADD FMUL FFMA FMNMX MUFU FCHK " + " ".join(sorted(FLOAT64 - {"DSETP"})),
+    "conversions": "I2F I2FP F2F F2FP F2I FRND",
+    "selections": "SEL FSEL FSET FSETP DSETP USEL",
+    "loads": "LDG LD LDL LDS LDC ULDC",
+    "stores": "STG ST STL STS",
+    "bytes": "PRMT LOP3 ULOP3 PLOP3 UPLOP3",
+    "moves": "MOV UMOV R2UR P2R R2P CS2R S2R S2UR",
+    "jumps": "BRA EXIT CALL RET BSSY BSYNC WARPSYNC NOP BREAK YIELD BMOV",
+}
+KIND_OF = {name: kind for kind, names in KINDS.items() for name in names.split()}
 
 
 @dataclass
@@ -35,6 +47,7 @@ class IssuedInstructions:
         waits: how often a thread waits for memory, one wait after another.
         read: addresses in global memory that are loaded.
         written: those that are stored.
+        kinds: issued instructions by `KINDS`; `index` counts the others.
     """
 
     instructions: int = 0
@@ -47,6 +60,7 @@ class IssuedInstructions:
     waits: int = 0
     read: frozenset[int] = frozenset()
     written: frozenset[int] = frozenset()
+    kinds: Counter[str] = field(default_factory=Counter)
 
 
 def issued(
@@ -76,6 +90,9 @@ def issued(
     of = lambda names: sum(n for at, n in most.items() if code[at].name in names)  # noqa: E731
     counts = IssuedInstructions(sum(most.values()), waits=waits)
     counts.float64, counts.atomics, counts.local = of(FLOAT64), of(ATOMIC), of(LOCAL)
+    for at, n in most.items():
+        moves = code[at].name == "IMAD" and "MOV" in code[at].modifiers
+        counts.kinds["moves" if moves else KIND_OF.get(code[at].name, "index")] += n
     reached: dict[bool, set[int]] = {True: set(), False: set()}
     for (_, _, is_load), accesses in groups.items():
         reached[is_load] |= {address for address, _ in accesses}

@@ -13,7 +13,7 @@ import re
 import struct
 from collections import Counter, defaultdict
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -188,6 +188,14 @@ def address_of(operand: str) -> tuple[int, tuple[tuple[str, str, int], ...]]:
     return number, tuple(terms)
 
 
+def wide_address(operand: str) -> str:
+    """Mark the register of an address of 64 bits where the text of the instruction does not.
+
+    An instruction with the modifier E has such an address, even if it is printed as `[R16+0x8]`.
+    """
+    return re.sub(r"^\[(R\d+)(?=[+\]])", r"[\1.64", operand)
+
+
 def decoded(code: dict[int, Instruction]) -> Program:
     """Return the steps of a kernel by address."""
     following = dict(itertools.pairwise(sorted(code)))
@@ -197,6 +205,8 @@ def decoded(code: dict[int, Instruction]) -> Program:
         plain = one.name[1:] if one.name[0] == "U" else one.name
         alias = "nothing" if one.name in IGNORED else ALIASES.get(plain, plain)
         execute = getattr(Lane, f"_do_{alias.lower()}", Lane._fail)
+        if "E" in one.modifiers:
+            one = replace(one, operands=tuple(wide_address(part) for part in one.operands))
         program[at] = DecodedInstruction(
             one, execute, set(one.modifiers), list(one.operands), named(one), following.get(at, at)
         )
@@ -783,6 +793,9 @@ class Lane:
             (self._put_long if wide else self._put)(o[place - 1], old)
             if own is None:
                 self._await(o[place - 1], address, size // 4)
+            # Whether the unit of global memory has done it; otherwise code after it does.
+            if place > 1 and PREDICATE.match(o[0]):
+                self._set(o[0], True)
         if m & {"CAS", "CAST"}:
             new = take(values[1]) if old == take(values[0]) else old
         elif m >= {"POPC", "INC"}:  # counts the threads that execute it

@@ -143,6 +143,20 @@ def lean(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis: i
 
 
 @wp.func
+def leans_of(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis: int, other: int):
+    """Return the slopes of the walls on two edges of a corner, see `lean`."""
+    first = float(0.0)
+    second = float(0.0)
+    edges = int(2)  # a variable, so that the loop is not unrolled
+    for n in range(edges):
+        one = wp.where(n == 0, axis, other)
+        slope = lean(S, cube, at, corner, one, axis + other - one)
+        first = wp.where(n == 0, slope, first)
+        second = slope
+    return wp.vec2(first, second)
+
+
+@wp.func
 def corner_area(a: float, b: float, lean_a: float, lean_b: float):
     """Return the area between a center and walls at a and b along two axes.
 
@@ -175,7 +189,8 @@ def open_area(
     """
     area = float(0.0)
     walls = int(0)
-    for n in range(4):
+    corners = int(4)  # a variable, so that the loop is not unrolled
+    for n in range(corners):
         here = first ^ wp.where(n == 1 or n == 2, 1 << along, 0) ^ wp.where(n > 1, 1 << other, 0)
         back = wp.where(n & 1 != 0, along, other)  # axis of the edge to the corner before
         if cube.distance[here, back] != _OPEN:
@@ -196,8 +211,8 @@ def open_area(
                 if count > 3:
                     area += 1.0
                 elif count == 1 and alike:
-                    lean_a = lean(S, cube, at, here, back, ahead)
-                    area += corner_area(a, b, lean_a, lean(S, cube, at, here, ahead, back))
+                    leans = leans_of(S, cube, at, here, back, ahead)
+                    area += corner_area(a, b, leans[0], leans[1])
                 else:
                     area += arc_area(count, a, b, alike)
     if walls == 0 and (corners >> first) & 1 != 0:
@@ -214,15 +229,17 @@ def wall_area(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corners: int, a
     vector area is minus the sum of theirs.
     """
     along = (axis + 1) % (cube.planes + 1)
-    near = float(0.0)
-    far = float(0.0)
-    if cube.planes == 1:
-        near = open_length(cube, corners, 0, along)
-        far = open_length(cube, corners, 1 << axis, along)
-    else:
-        near = open_area(S, cube, at, corners, 0, along, (axis + 2) % 3)
-        far = open_area(S, cube, at, corners, 1 << axis, along, (axis + 2) % 3)
-    return float(cube.sides[axis]) * (near - far)
+    difference = float(0.0)  # of the open parts of the near and the far side
+    sides = int(2)  # a variable, so that the loop is not unrolled
+    for n in range(sides):
+        first = wp.where(n == 0, 0, 1 << axis)
+        area = float(0.0)
+        if cube.planes == 1:
+            area = open_length(cube, corners, first, along)
+        if cube.planes == 2:
+            area = open_area(S, cube, at, corners, first, along, (axis + 2) % 3)
+        difference = wp.where(n == 0, area, difference - area)
+    return float(cube.sides[axis]) * difference
 
 
 @wp.func
@@ -232,9 +249,8 @@ def is_bent(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis
     a = cube.distance[corner, axis]
     b = cube.distance[corner, other]
     if a != _OPEN and b != _OPEN:
-        lean_a = lean(S, cube, at, corner, axis, other)
-        lean_b = lean(S, cube, at, corner, other, axis)
-        bent = corner_area(a, b, lean_a, lean_b) > (0.5 + _BENT) * a * b
+        leans = leans_of(S, cube, at, corner, axis, other)
+        bent = corner_area(a, b, leans[0], leans[1]) > (0.5 + _BENT) * a * b
     return bent
 
 

@@ -70,7 +70,8 @@ def mean_of(field: F32, known: I8, axis: int, component: int, k: int, j: int, i:
     """
     total = float(0.0)
     count = float(0.0)
-    for n in range(4):
+    around = int(4)  # a variable, so that the loop is not unrolled
+    for n in range(around):
         a = n & 1  # 0: the cell of the face; 1: the cell below
         b = n >> 1  # 0: its lower face; 1: its upper face
         z = k - wp.where(axis == 2, a, 0) + wp.where(component == 2, b, 0)
@@ -234,9 +235,10 @@ def drag_kernel(
             pulls = float(0.0)
             now = float(0.0)
             last = int(e)
+            sides = int(2)  # a variable, so that the loop is not unrolled
             # First the sum over all pieces, then the share of each one.
             for turn in range(wp.where(values, 2, 1)):
-                for side in range(2):
+                for side in range(sides):
                     z = wp.where(side == 0, k, c)
                     y = wp.where(side == 0, j, b)
                     s = wp.where(side == 0, i, a)

@@ -20,7 +20,7 @@ from warp_lcp.benchmarks.validation.scenes import (
     create_liquid,
     steps,
 )
-from warp_lcp.files.tables import Tables
+from warp_lcp.files import Tables
 from warp_lcp.fluids import LiquidSimulation
 
 SHARE = 0.05  # splitting error above which a step is solved at once

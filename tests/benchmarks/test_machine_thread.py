@@ -106,6 +106,22 @@ def test_compare_and_swap() -> None:
     assert found == [0, 9, 2]
 
 
+def test_wide_address_without_a_mark() -> None:
+    """Generic compare and swap: 64-bit address printed as one register; the predicate is set."""
+    memory = memory_of(np.array([5, 0], np.int64))
+    lane = lane_of(
+        memory,
+        "MOV R4, 0x5",
+        "MOV R6, 0x9",
+        "ATOM.E.CAS.64.STRONG.GPU P1, R10, [R2], R4, R6",
+        "LD.E.64 R12, [R2]",
+        "ST.E.64 [R2+0x8], R12",
+    )
+    assert lane.predicates["P1"]
+    assert (lane.registers["R10"], lane.registers["R12"]) == (5, 9)
+    assert int.from_bytes(memory.read(AT + 8, 8), "little") == 9
+
+
 def test_reductions_of_reals() -> None:
     single, double = np.full(COUNT, 0.1, np.float32), np.full(COUNT, 0.1)
     memory = memory_of(single)
@@ -217,6 +233,21 @@ def test_vote_to_a_predicate(kind: str) -> None:
     )
     assert (lane.predicates["UP6"], lane.predicates["UP5"]) == (kind == "EQ", kind == "NE")
     assert lane.registers["UR5"] == 1
+
+
+def test_kinds_of_instructions() -> None:
+    code = code_of(
+        "LDG.E R4, desc[UR4][R2.64]",
+        "IMAD.MOV.U32 R5, RZ, RZ, R4",
+        "IMAD R6, R5, R5, RZ",
+        "FADD R7, R6, R6",
+        "STG.E desc[UR4][R2.64], R7",
+    )
+    # The threads read and write at address 0, which this memory has.
+    memory = EmulatedMemory([(0, np.zeros(COUNT, np.int32))])
+    found = issued(code, constants_of(b"", 32, 1), memory, [(0, 0), (1, 0)])
+    assert found.kinds == {"loads": 1, "moves": 1, "index": 1, "float": 1, "stores": 1, "jumps": 1}
+    assert sum(found.kinds.values()) == found.instructions
 
 
 def test_generic_addresses_of_the_stack() -> None:

@@ -159,40 +159,50 @@ def cross_kernel(
     Faces of the domain keep their state. `below` and `above` are the distances [cells] to the solid
     from the centers of the cells below and above a face.
     """
-    crossed = int(0)
+    found = int(0)
+    lines = int(0)  # 1: a line from x to y; 2: back as well
+    x = wp.vec3()
+    y = wp.vec3()
     is_apart = (int(apart[k, j, i]) >> axis) & 1 != 0
-    if not is_apart and open[k, j, i] > 0.0 and B.near[k, j, i] != wp.uint8(0):
+    if is_apart or (open[k, j, i] > 0.0 and B.near[k, j, i] != wp.uint8(0)):
         if wall[k, j, i] != wp.int16(0):
-            found = int(0)
             c, b, a = next_to(axis, -1, k, j, i)
-            if B.near[k, j, i] == wp.uint8(INSIDE) or B.near[c, b, a] == wp.uint8(INSIDE):
+            if is_apart:
+                # Rounding may make a path miss a solid on whose surface one of its ends lies.
+                lines = 2
+                x = place_of(B, CENTERS, k, j, i)
+                y = place_of(B, CENTERS, c, b, a)
+            elif B.near[k, j, i] == wp.uint8(INSIDE) or B.near[c, b, a] == wp.uint8(INSIDE):
                 found, _n, _d = nearest_wall(B, place_of(B, axis, k, j, i), REACH * B.dx)
             elif open[k, j, i] < 1.0:
+                lines = 1
                 middle = open_center(B, axis, nodes, k, j, i)
                 half = wp.vec3()
                 half[axis] = 0.5 * B.dx
-                found, _t = wall_between(B, middle - half, middle + half)
-            if found > 0:
-                crossed = found
-                above[k, j, i] = 1.0
-                below[k, j, i] = 1.0
-                wall[k, j, i] = wp.int16(found)
-                open[k, j, i] = 0.0
-    if is_apart:
-        if wall[k, j, i] != wp.int16(0):
-            x = place_of(B, CENTERS, k, j, i)
-            c, b, a = next_to(axis, -1, k, j, i)
-            y = place_of(B, CENTERS, c, b, a)
-            found, t = wall_between(B, x, y)
-            crossed = found
-            above[k, j, i] = wp.min(t, 1.0)
-            # Rounding may make the path miss a solid on whose surface one of its ends lies.
-            _found, t = wall_between(B, y, x)
-            below[k, j, i] = wp.min(t, 1.0)
-            if open[k, j, i] > 0.0:
-                wall[k, j, i] = wp.int16(crossed)
-            open[k, j, i] = 0.0
-    number[k, j, i] = wp.int16(crossed)
+                x = middle - half
+                y = middle + half
+    forth = float(1.0)
+    back = float(1.0)
+    for n in range(lines):
+        solid, t = wall_between(B, x, y)
+        if n == 0:
+            found = solid
+            forth = t
+        else:
+            back = t
+        start = x
+        x = y
+        y = start
+    if lines == 2 or found > 0:
+        above[k, j, i] = 1.0
+        below[k, j, i] = 1.0
+        if is_apart:
+            above[k, j, i] = wp.min(forth, 1.0)
+            below[k, j, i] = wp.min(back, 1.0)
+        if open[k, j, i] > 0.0:
+            wall[k, j, i] = wp.int16(found)
+        open[k, j, i] = 0.0
+    number[k, j, i] = wp.int16(found)
 
 
 @wp.struct
@@ -375,8 +385,11 @@ def edge_kernel(
             area = float(1.0)
             for d in range(B.planes + 1):
                 if d != axis:
-                    width = open_width(B, C, axis, d, 0, k, j, i)
-                    area *= width + open_width(B, C, axis, d, 1, k, j, i)
+                    width = float(0.0)
+                    sides = int(2)  # a variable, so that the loop is not unrolled
+                    for side in range(sides):
+                        width += open_width(B, C, axis, d, side, k, j, i)
+                    area *= width
             open[k, j, i] = wp.max(area, LEAST_OPEN)
             code = sight_code(axis, wp.vec3())
         elif known and ends:
@@ -411,10 +424,18 @@ def calm_kernel(k, j, i, near: U8, base: I8, calm: I8):
 @wp.func
 def beside(B: Barrier, x: wp.vec3, y: wp.vec3, way: wp.vec3):
     """Return whether a path from x to y, shifted sideways by `way`, is free."""
-    free = bool(False)
-    if sees(B, x, x + way):
-        if sees(B, x + way, y + way):
-            free = sees(B, y + way, y)
+    free = bool(True)
+    here = x
+    lines = int(3)  # a variable, so that the loop is not unrolled
+    for n in range(lines):
+        there = x + way
+        if n == 1:
+            there = y + way
+        if n == 2:
+            there = y
+        if free:
+            free = sees(B, here, there)
+        here = there
     return free
 
 

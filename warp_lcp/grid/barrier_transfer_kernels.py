@@ -12,7 +12,16 @@ from warp_lcp.grid.barrier_geometry import (
     sees,
     sight_of,
 )
-from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, U8, cell_kernel, list_kernel, spline
+from warp_lcp.grid.cell_kernel import (
+    F32,
+    INTS,
+    POINTS,
+    U8,
+    cell_kernel,
+    list_kernel,
+    of_axis,
+    spline,
+)
 
 MODULE = "warp_lcp.grid.barriers.transfer"
 # Least weight of a face of a particle's own cell, as in `warp_lcp.grid.transfer`.
@@ -112,11 +121,13 @@ def gather_kernel(
 
 
 @wp.func
-def seen(B: Barrier, axis: int, x: wp.vec3, room: float, field: F32):
-    """Interpolate a component from the faces that a point sees.
+def seen(B: Barrier, axis: int, x: wp.vec3, room: float, n: int, one: F32, two: F32, three: F32):
+    """Interpolate a component, field n of three, from the faces that a point sees.
 
     Returns the value, its gradient [1/m] and the weight of the visible faces. Faces that the point
-    does not see get the mean of the others. `room` is the point's distance from solids [m].
+    does not see get the mean of the others. `room` is the point's distance from solids [m]. The
+    field is selected here so that kernels call this function in one place: each call is inlined,
+    with its lines of sight, and many copies take more registers than a thread has.
     """
     g = x / B.dx + wp.vec3(
         1.0 - float(B.origin[0]), 1.0 - float(B.origin[1]), 1.0 - float(B.origin[2])
@@ -139,10 +150,10 @@ def seen(B: Barrier, axis: int, x: wp.vec3, room: float, field: F32):
     sum = float(0.0)
     total = float(0.0)
     corners = 4 * B.planes
-    for n in range(corners):
-        a = n & 1
-        b = (n >> 1) & 1
-        c = n >> 2
+    for m in range(corners):
+        a = m & 1
+        b = (m >> 1) & 1
+        c = m >> 2
         w = wp.where(a == 1, f[0], 1.0 - f[0]) * wp.where(b == 1, f[1], 1.0 - f[1])
         if B.planes == 2:
             w *= wp.where(c == 1, f[2], 1.0 - f[2])
@@ -150,20 +161,20 @@ def seen(B: Barrier, axis: int, x: wp.vec3, room: float, field: F32):
         if not free:
             free = sees(B, x, sight_of(B, axis, k + c, j + b, i + a))
         if free:
-            v = field[k + c, j + b, i + a]
-            values[n] = v
-            there[n] = 1.0
+            v = of_axis(n, one, two, three, k + c, j + b, i + a)
+            values[m] = v
+            there[m] = 1.0
             sum += wp.max(w, 1.0e-6)
             total += wp.max(w, 1.0e-6) * v
     mean = total / wp.max(sum, 1.0e-30)
     value = float(0.0)
     slope = wp.vec3()
-    for n in range(corners):
-        a = n & 1
-        b = (n >> 1) & 1
-        c = n >> 2
-        v = values[n]
-        if there[n] == 0.0:
+    for m in range(corners):
+        a = m & 1
+        b = (m >> 1) & 1
+        c = m >> 2
+        v = values[m]
+        if there[m] == 0.0:
             v = mean
         wx = wp.where(a == 1, f[0], 1.0 - f[0])
         wy = wp.where(b == 1, f[1], 1.0 - f[1])
@@ -221,12 +232,21 @@ def interpolate_kernel(
     c, b, a = cell_at(B, x, shape_of(B.near))
     if B.near[c, b, a] != wp.uint8(0):
         room = room_at(B, x, TENT * B.dx)
-        value, slope, sum = seen(B, axis, x, room, field)
+        value = float(0.0)
+        slope = wp.vec3()
+        sum = float(0.0)
+        fields = wp.where(flip > 0.0, 2, 1)
+        for n in range(fields):
+            if n == 0 or sum > 0.0:
+                here, way, weight = seen(B, axis, x, room, n, field, saved, saved)
+                if n == 0:
+                    value = here
+                    slope = way
+                    sum = weight
+                else:
+                    value += flip * (before[i][axis] - here)
         v = velocity[i]
         if sum > 0.0:
-            if flip > 0.0:
-                old, _slope, _sum = seen(B, axis, x, room, saved)
-                value += flip * (before[i][axis] - old)
             v[axis] = value
             velocity[i] = v
             if gradient:
@@ -240,12 +260,11 @@ def velocity_at(B: Barrier, u: F32, v: F32, w: F32, x: wp.vec3):
     The component along an axis is 0 if no face of that axis is visible.
     """
     room = room_at(B, x, TENT * B.dx)
-    a, _a, _sa = seen(B, 0, x, room, u)
-    b, _b, _sb = seen(B, 1, x, room, v)
-    c = float(0.0)
-    if B.planes == 2:
-        c, _c, _sc = seen(B, 2, x, room, w)
-    return wp.vec3(a, b, c)
+    result = wp.vec3()
+    for axis in range(B.planes + 1):
+        value, _slope, _sum = seen(B, axis, x, room, axis, u, v, w)
+        result[axis] = value
+    return result
 
 
 @list_kernel(MODULE)
@@ -274,15 +293,20 @@ def carry_kernel(
     c, b, a = cell_at(B, x, shape_of(B.near))
     if B.near[c, b, a] != wp.uint8(0):
         if distance[c, b, a] > FREE:
-            first = velocity_at(B, u, v, w, x)
-            y = x + 0.5 * dt * first
+            # At the start, and at the midpoint if it lies inside and is visible.
+            way = wp.vec3()
+            y = x
             inside = bool(True)
-            for d in range(B.planes + 1):
-                if y[d] < low[d] or y[d] > high[d]:
-                    inside = False
-            way = first
-            if inside:
-                if sees(B, x, y):
+            looks = int(2)  # a variable, so that the loop is not unrolled
+            for n in range(looks):
+                if n == 1:
+                    y = x + 0.5 * dt * way
+                    for d in range(B.planes + 1):
+                        if y[d] < low[d] or y[d] > high[d]:
+                            inside = False
+                    if inside:
+                        inside = sees(B, x, y)
+                if inside:
                     way = velocity_at(B, u, v, w, y)
             y = x + dt * way
             position[i] = wp.max(wp.min(y, most), least)

@@ -37,7 +37,9 @@ class FaceMarks:
 
 
 @wp.func
-def mean_around(B: Barrier, axis: int, other: int, k: int, j: int, i: int, field: F32, known: I8):
+def mean_around(
+    B: Barrier, axis: int, other: int, k: int, j: int, i: int, U: FaceComponents, K: FaceMarks
+):
     """Return the mean of another component over the known faces that a face sees.
 
     The mean is 0 if there are none.
@@ -51,9 +53,9 @@ def mean_around(B: Barrier, axis: int, other: int, k: int, j: int, i: int, field
         above = n >> 1
         c, b, a = next_to(axis, -below, k, j, i)
         c, b, a = next_to(other, above, c, b, a)
-        if known[c, b, a] > wp.int8(0):
+        if of_axis(other, K.u, K.v, K.w, c, b, a) > wp.int8(0):
             if sees(B, x, sight_of(B, other, c, b, a)):
-                total += field[c, b, a]
+                total += of_axis(other, U.u, U.v, U.w, c, b, a)
                 count += 1.0
     return total / wp.max(count, 1.0)
 
@@ -101,12 +103,9 @@ def constrain_kernel(
                     a = i
                 held = int(kind[c, b, a]) == fluid and int(contact[c, b, a]) != released
                 speed = wp.vec3()
-                if axis != 0:
-                    speed[0] = mean_around(B, axis, 0, k, j, i, U.u, K.u)
-                if axis != 1:
-                    speed[1] = mean_around(B, axis, 1, k, j, i, U.v, K.v)
-                if axis != 2 and B.planes == 2:
-                    speed[2] = mean_around(B, axis, 2, k, j, i, U.w, K.w)
+                for other in range(B.planes + 1):
+                    if other != axis:
+                        speed[other] = mean_around(B, axis, other, k, j, i, U, K)
                 speed[axis] = own
                 relative = wp.dot(n, speed - moving)
                 if held or relative < 0.0:

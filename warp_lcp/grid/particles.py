@@ -12,7 +12,6 @@ import warp as wp
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, ListMemory, launch
-from warp_lcp.grid.particle_seeding import lattice, seed  # noqa: F401 - their older place
 from warp_lcp.grid.radix_sort import digits_of, sort_keys
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels import Rows

@@ -22,7 +22,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from warp_lcp.grid.particle_loops import MARGIN
-from warp_lcp.grid.particles import lattice, seed
+from warp_lcp.grid.particle_seeding import lattice, seed
 from warp_lcp.grid.signed_distance import Geometry
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.thin_walls import ThinWalls
