@@ -13,6 +13,7 @@ import warp_lcp as wl
 from default_run import few
 from small_liquids import GRAVITY, box, create, scene
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.fluids.stokes_operator import KEEP
 from warp_lcp.operators.grid_poisson import FLUID
 
 ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
@@ -64,22 +65,23 @@ def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
     """Return the equations at the current velocity and pressure."""
     stokes, projection = simulation.stokes, simulation.projection
     kind = projection.kind.numpy()
-    stokes._allocate()
-    stokes._free.assign((kind == FLUID).astype(np.uint8))
-    stokes._residual(simulation.velocity, 0)
-    r = stokes.r.numpy().astype(float)
-    size = stokes._size
-    volume = np.concatenate([v.numpy().ravel() for v in stokes._equations.level.volume])
+    stokes.allocate()
+    operator, residual = stokes.operator, stokes._preconditioner.r
+    operator.free.assign((kind == FLUID).astype(np.uint8))
+    stokes.residual(simulation.velocity, KEEP)
+    r = residual.numpy().astype(float)
+    size = operator.layout.velocities.stop
+    volume = np.concatenate([v.numpy().ravel() for v in operator.level.volume])
     faces, cells = np.flatnonzero(volume > 0.0), np.flatnonzero(kind.ravel() == FLUID)
     columns = np.concatenate([faces, size + cells])
-    p, q = (wp.zeros(stokes.r.size, dtype=wp.float32, device="cpu") for _ in range(2))
+    p, q = (wp.zeros(residual.size, dtype=wp.float32, device="cpu") for _ in range(2))
     K = np.zeros((len(columns), len(columns)))
     for number, column in enumerate(columns):
         unit = np.zeros(p.size, dtype=np.float32)
         unit[column] = 1.0
         p.assign(unit)
         q.zero_()
-        stokes._product(p, q)
+        operator.product(p, q)
         K[:, number] = q.numpy()[columns]
     n = len(faces)
     lower = projection.lower
@@ -91,7 +93,7 @@ def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
         D=-S[n:, :n],
         C=-S[n:, n:],
         r=r[columns[:n]],
-        y=stokes._outflows.numpy().ravel()[cells].astype(float),
+        y=operator.outflows.numpy().ravel()[cells].astype(float),
         room=room,
         asymmetry=float(np.abs(K - K.T).max() / np.abs(K).max()),
     )
@@ -105,7 +107,7 @@ def coupled_step(
     solve = simulation.stokes.solve
 
     def watched(*arguments: Any) -> Any:
-        simulation.stokes.set_up(arguments[1])
+        simulation.stokes.operator.set_up(arguments[1])
         found.append(dense(simulation))
         # The equations of the viscous solve are those of before again.
         found.append(simulation.stokes.couple(arguments[0], np.inf, arguments[2]))
