@@ -576,6 +576,11 @@ class PressureProjection:
         self.grid.part.fill(*velocity, *self.known, self.contact)
 
     @property
+    def last_kick(self) -> float:
+        """Time that forces acted in the last projection [s]; 0 before the first one."""
+        return self._last
+
+    @property
     def lower(self) -> wp.array | None:
         """Lower bound of x in each cell; None without separating walls."""
         return self._lower

@@ -17,8 +17,8 @@ and walls is that of `fluids.viscosity`; the bound ignores the difference.)
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -29,9 +29,10 @@ from warp_lcp.fluids.stokes_operator import FIRST, KEEP, LOOK, StokesOperator
 from warp_lcp.fluids.stokes_preconditioner import StokesPreconditioner
 from warp_lcp.fluids.stokes_vectors import WindowSums
 from warp_lcp.fluids.viscosity import Viscosity
-from warp_lcp.grid.staggered import StaggeredGrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.kernels.vectors import RowReduction, rows_of
 from warp_lcp.krylov.gmres import GMRES
 from warp_lcp.krylov.system import NORM
@@ -104,6 +105,7 @@ class StokesSolve:
     Attributes:
         operator: the equations.
         unsupported: whether bodies thinner than a cell leave the split step alone.
+        continues: whether the next step begins with a coupled solve, see `couple_from_last`.
     """
 
     def __init__(
@@ -140,11 +142,34 @@ class StokesSolve:
         self._corrections = LaunchGraph(
             grid.device, self._launch_corrections, at_once=grid.device.is_cuda
         )
+        self._start_from_last = LaunchGraph(
+            grid.device, self._launch_start_from_last, at_once=grid.device.is_cuda
+        )
+        self._estimate_graph = LaunchGraph(
+            grid.device, self._launch_pressure_difference, at_once=grid.device.is_cuda
+        )
         self._krylov: GMRES | None = None  # built, with its vectors, at the first use
+        self.continues = False
+        self._last = grid.faces()  # velocity at the end of the last coupled step
+        self._last_bodies = np.zeros(self.operator.layout.rank)
+        self._ratio = Scalar(1.0)  # of the times that forces act in this step and the last one
 
-    def keep_start(self, velocity: Sequence[wp.array]) -> None:
-        """Store u*, the velocity before viscosity and pressure, and V* of the bodies."""
+    def keep_start(self, velocity: Sequence[wp.array], kick_dt: float) -> None:
+        """Store u*, the velocity before viscosity and pressure, V*, and the last pressure."""
         self.operator.keep_start(velocity)
+        if self.continues:
+            self.allocate()
+            last = self._projection.last_kick
+            self._ratio.value = kick_dt / last if last > 0.0 else 0.0
+            copy(self._last_pressure, self._projection.pressure)
+
+    def keep_end(self, velocity: Sequence[wp.array]) -> None:
+        """Store the velocity at the end of a coupled step, extrapolated into the air."""
+        if self.continues:
+            for saved, u in zip(self._last, velocity, strict=True):
+                copy(saved, u)
+            if self.operator.bodies is not None:
+                self._last_bodies = self.operator.bodies.velocities
 
     def keep_viscous(self, velocity: Sequence[wp.array]) -> None:
         """Store u2, the velocity on which viscosity has acted."""
@@ -175,9 +200,12 @@ class StokesSolve:
             size = math.hypot(size, math.sqrt(max(dissipated, 0.0)))
         share = error / size if size > 0.0 else 0.0
         small = error <= FLOOR * math.sqrt(start)
+        self.continues = False
         if self.unsupported or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
-        return self.couple(velocity, share, moved)
+        result = self.couple(velocity, share, moved)
+        self.continues = result.used
+        return result
 
     def _launch_estimation(
         self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array
@@ -211,7 +239,9 @@ class StokesSolve:
                 self.operator.product, self._preconditioner, restart=VECTORS, weight=weight
             )
             self._norm = RowReduction(rows_of(weight))
-            self._split_pressure = self._grid.field(wp.float64)
+            self._split_pressure, self._last_pressure = (
+                self._grid.field(wp.float64) for _ in range(2)
+            )
         return self._krylov
 
     def residual(self, velocity: Sequence[wp.array], look: int) -> int:
@@ -229,21 +259,125 @@ class StokesSolve:
             share: its splitting error.
             moved: called when the velocities of bodies have changed.
         """
+        self.allocate()
+        self._save(velocity)
+        return self._iterate(velocity, share, moved)
+
+    def couple_from_last(
+        self,
+        velocity: Sequence[wp.array],
+        window: Window,
+        kick_dt: float,
+        moved: Callable[[], None],
+    ) -> StokesResult:
+        """Solve for velocity and pressure at once, from those of the last step.
+
+        The split step is left out: thick liquid changes so slowly that the last step is nearer. The
+        result is not used if the solve fails, or if the last step is no better than a velocity of
+        0: the split step follows.
+
+        With x1 the pressure of the first projection, A (u - u2) = D'(x - x1) up to walls. One
+        viscous cycle estimates |u - u2|_V, which is at most twice the bound of the split step; the
+        next step begins likewise if it exceeds the splitting tolerance.
+
+        Args:
+            velocity: velocity of the first projection, each component [m/s] (updated).
+            window: cells that hold all liquid, with a margin of two.
+            kick_dt: time that forces have acted [s].
+            moved: called when the velocities of bodies have changed.
+        """
+        projection, operator = self._projection, self.operator
+        self.continues = False
+        if not self._viscosity.prepare(window, projection.kind, projection.contact, kick_dt):
+            return StokesResult(0.0, 0, 0.0, converged=True, used=False)
+        self.allocate()
+        self._save(velocity)
+        operator.take_equations(kick_dt)
+        self._start_from_last.run(velocity, projection.kind, projection.contact)
+        if operator.bodies is not None:
+            operator.bodies.move(self._last_bodies - operator.bodies.velocities)
+            moved()
+        result = self._iterate(velocity, 0.0, moved, farthest=1.0)
+        if not result.used:
+            return result
+        error, size = self._splitting_error(), self._size(velocity)
+        share = error / size if size > 0.0 else 0.0
+        start = operator.kinetic_energy(operator.start)
+        self.continues = share > self.splitting_tolerance and error > FLOOR * math.sqrt(start)
+        return replace(result, splitting_error=share)
+
+    def _launch_start_from_last(
+        self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array
+    ) -> None:
+        """Set up the equations; write the last velocity on faces with mass, and pressure."""
+        operator = self.operator
+        operator.launch_set_up(kind, contact)
+        for axis, (u, last) in enumerate(zip(velocity, self._last, strict=True)):
+            operator.window.run(
+                operator.kernels.start_velocity, u=u, other=last, volume=operator.level.volume[axis]
+            )
+        operator.window.run(
+            operator.kernels.start_pressure,
+            x=self._projection.pressure,
+            other=self._last_pressure,
+            kind=kind,
+            ratio=self._ratio,
+        )
+
+    def _splitting_error(self) -> float:
+        """Return an estimate of |u - u2|_V, see `couple_from_last`."""
+        operator, preconditioner = self.operator, self._preconditioner
+        self._estimate_graph.run()
+        operator.product(preconditioner.work, preconditioner.r)
+        norm = preconditioner.viscous_norm()
+        self._viscosity.multigrid.r.zero_()  # see `_launch_estimation`
+        return norm
+
+    def _launch_pressure_difference(self) -> None:
+        """Write x - x1, without velocities, to a vector."""
+        operator, work = self.operator, self._preconditioner.work
+        clear(work)
+        operator.window.run(
+            operator.kernels.pressure_difference,
+            out=operator.layout.pressure(work),
+            x=self._projection.pressure,
+            other=self._split_pressure,
+            kind=self._projection.kind,
+        )
+
+    def _size(self, velocity: Sequence[wp.array]) -> float:
+        """Return |u|_A, after a residual."""
+        mass = self.operator.kinetic_energy(velocity)
+        return math.sqrt(mass + max(self.operator.dissipated, 0.0))
+
+    def _iterate(
+        self,
+        velocity: Sequence[wp.array],
+        share: float,
+        moved: Callable[[], None],
+        farthest: float = math.inf,
+    ) -> StokesResult:
+        """Iterate from a velocity and a pressure; without use, restore those of `_save`.
+
+        Args:
+            velocity: see `couple`, like the other arguments.
+            share: see `couple`.
+            moved: see `couple`.
+            farthest: error of the start, relative to |u|_A, above which the solve ends at once.
+        """
         krylov = self.allocate()
         operator, preconditioner = self.operator, self._preconditioner
-        self._save(velocity)
         preconditioner.set_up(velocity)
         self.residual(velocity, FIRST)
         preconditioner.restrict()
         settled, iterations, first = self._projection.lower is None, 0, None
         while True:
             error = preconditioner.estimate()
-            mass = operator.kinetic_energy(velocity)
-            size = math.sqrt(mass + max(operator.dissipated, 0.0))
+            size = self._size(velocity)
             relative = error / size if size > 0.0 else 0.0
             first = relative if first is None else first
             done = relative <= self.tolerance or iterations >= self.max_iterations
-            if done or not math.isfinite(relative):
+            if done or not math.isfinite(relative) or first > farthest:
                 break
             share_of_norm = min(0.5 * self.tolerance / relative, 0.5)
             if not settled:  # the free cells are determined again in between
@@ -306,6 +440,21 @@ class StokesSolve:
         if bodies is not None:
             bodies.move(self._split_bodies - bodies.velocities)
             moved()
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the state: where the next step begins."""
+        return {
+            "coupled_velocity": np.stack([u.numpy() for u in self._last]),
+            "coupled_bodies": self._last_bodies.copy(),
+            "coupled": np.array(float(self.continues)),
+        }
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Restore `state`, whose arrays have been checked."""
+        for u, values in zip(self._last, state["coupled_velocity"], strict=True):
+            u.assign(values)
+        self._last_bodies = np.array(state["coupled_bodies"])
+        self.continues = bool(state["coupled"])
 
     def impulses(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
         """Return the viscous impulses on solids, see `viscous_impulses`."""

@@ -126,6 +126,21 @@ class StokesPreconditioner:
             self.operator.bodies.add_outflow(z_bodies, self._pressure.r, self._free_cells, sign=1.0)
         self._graphs["_launch_pressures"].run(self._pressure.program)
 
+    def viscous_norm(self) -> float:
+        """Return an estimate of |u|_V, with A u = r, by a viscous cycle.
+
+        It writes the velocities of z. |u|_V^2 = |u|_A^2 - |u|_M^2, and the mass of bodies.
+        """
+        self._graphs["_launch_velocities"].run(self.operator.viscosity.multigrid.program)
+        u = self.layout.components(self.z)
+        square = self._squares.read()[0] - self.operator.kinetic_energy(u)
+        bodies = self.operator.bodies
+        if bodies is not None:
+            r_bodies = self.layout.bodies(self.r)
+            z_bodies = bodies.corrected(r_bodies, self.z)
+            square += bodies.square(z_bodies, r_bodies - z_bodies)
+        return math.sqrt(max(square, 0.0))
+
     def estimate(self) -> float:
         """Write z = P r; return an estimate of the error, the energy norm of z."""
         self.apply()

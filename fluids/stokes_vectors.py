@@ -25,13 +25,14 @@ class StokesLayout:
 
     Attributes:
         size: number of elements.
+        rank: number of unknowns of bodies.
         velocities: the part of the velocities.
     """
 
     def __init__(self, grid: StaggeredGrid, multigrid: ViscosityMultigrid, rank: int) -> None:
         self._grid, self._multigrid = grid, multigrid
         first = grid.dimension * grid.size
-        self.size = first + grid.size + rank
+        self.size, self.rank = first + grid.size + rank, rank
         self.velocities = slice(0, first)
         self._pressures = slice(first, first + grid.size)
         self._bodies = slice(first + grid.size, self.size)
