@@ -25,7 +25,7 @@ import warp as wp
 
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.stokes_forces import viscous_impulses
-from warp_lcp.fluids.stokes_operator import FIRST, KEEP, LOOK, StokesOperator
+from warp_lcp.fluids.stokes_operator import FIRST, LOOK, StokesOperator
 from warp_lcp.fluids.stokes_preconditioner import StokesPreconditioner
 from warp_lcp.fluids.stokes_vectors import WindowSums
 from warp_lcp.fluids.viscosity import Viscosity
@@ -33,14 +33,13 @@ from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.recorded_arguments import Scalar
-from warp_lcp.kernels.vectors import RowReduction, rows_of
-from warp_lcp.krylov.gmres import GMRES
-from warp_lcp.krylov.system import NORM
+from warp_lcp.krylov.flexible_gmres import FlexibleGMRES
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.rigid.bodies import RigidBodies
 
 STOKES_COLUMNS = ("splitting_error", "stokes_iterations", "stokes_error")
-VECTORS = 40  # of a Krylov space before a restart
+VECTORS = 24  # of a Krylov space before a restart
+STALLED = 0.99  # a restart that leaves more than this share of the error ends the solve
 TENTH = 0.1  # decrease of the residual after which the free cells are determined again
 # Splitting errors below this share of |u*|_M are smaller than errors of the pressure solves.
 FLOOR = 1e-3
@@ -148,7 +147,7 @@ class StokesSolve:
         self._estimate_graph = LaunchGraph(
             grid.device, self._launch_pressure_difference, at_once=grid.device.is_cuda
         )
-        self._krylov: GMRES | None = None  # built, with its vectors, at the first use
+        self._krylov: FlexibleGMRES | None = None  # built, with its vectors, at the first use
         self.continues = False
         self._last = grid.faces()  # velocity at the end of the last coupled step
         self._last_bodies = np.zeros(self.operator.layout.rank)
@@ -230,24 +229,27 @@ class StokesSolve:
         operator.take_energy(self._start, operator.start, operator.start)
         clear(p)  # the viscous solve writes the rows of its own unknowns only
 
-    def allocate(self) -> GMRES:
+    def allocate(self) -> FlexibleGMRES:
         """Allocate the vectors, the preconditioner and the Krylov method, once."""
         if self._krylov is None:
             self._preconditioner = StokesPreconditioner(self.operator)
             weight = self._preconditioner.weight
-            self._krylov = GMRES(
-                self.operator.product, self._preconditioner, restart=VECTORS, weight=weight
+            self._krylov = FlexibleGMRES(
+                self.operator.product,
+                self._preconditioner,
+                restart=VECTORS,
+                weight=weight,
+                at_once=self.operator.bodies is not None,
             )
-            self._norm = RowReduction(rows_of(weight))
             self._split_pressure, self._last_pressure = (
                 self._grid.field(wp.float64) for _ in range(2)
             )
         return self._krylov
 
-    def residual(self, velocity: Sequence[wp.array], look: int) -> int:
+    def residual(self, velocity: Sequence[wp.array]) -> None:
         """Write the residual to the preconditioner, see `StokesOperator.residual`."""
         preconditioner = self._preconditioner
-        return self.operator.residual(velocity, look, preconditioner.r, preconditioner.work)
+        self.operator.residual(velocity, preconditioner.r, preconditioner.work)
 
     def couple(
         self, velocity: Sequence[wp.array], share: float, moved: Callable[[], None]
@@ -368,31 +370,35 @@ class StokesSolve:
         krylov = self.allocate()
         operator, preconditioner = self.operator, self._preconditioner
         preconditioner.set_up(velocity)
-        self.residual(velocity, FIRST)
+        operator.find_free_cells(velocity, FIRST)
+        self.residual(velocity)
         preconditioner.restrict()
-        settled, iterations, first = self._projection.lower is None, 0, None
+        settled, switched, iterations = self._projection.lower is None, 0, 0
+        first = before = math.inf
         while True:
-            error = preconditioner.estimate()
-            size = self._size(velocity)
+            error, size = preconditioner.estimate(), self._size(velocity)
             relative = error / size if size > 0.0 else 0.0
-            first = relative if first is None else first
+            first = min(first, relative)
+            stalled = relative > STALLED * before and not switched
             done = relative <= self.tolerance or iterations >= self.max_iterations
-            if done or not math.isfinite(relative) or first > farthest:
+            if done or stalled or not math.isfinite(relative) or first > farthest:
                 break
-            share_of_norm = min(0.5 * self.tolerance / relative, 0.5)
-            if not settled:  # the free cells are determined again in between
-                share_of_norm = max(share_of_norm, TENTH)
-            square = self._norm.of(NORM, r=preconditioner.r, w=preconditioner.weight)[0]
-            norm = float(np.sqrt(square))
-            iterations += krylov.solve(share_of_norm * norm, VECTORS)[0]
-            self._corrections.run(velocity, krylov.x)
-            if operator.bodies is not None:
-                operator.bodies.move(operator.layout.bodies(krylov.x))
-                moved()
-            switched = self.residual(velocity, LOOK)
-            settled = not switched
+            norm = krylov.begin()
+            least = min(0.5 * self.tolerance / relative, 0.5) * norm
+            goal, left, before, switched = least, math.inf, relative, 0
+            while left > least and not switched and not krylov.full:
+                if not settled:  # the free cells are determined again in between
+                    goal = max(least, TENTH * norm)
+                added, left = krylov.extend(goal)
+                iterations += added
+                self._corrections.run(velocity, krylov.x)
+                if operator.bodies is not None:
+                    operator.bodies.move(operator.layout.bodies(krylov.x))
+                    moved()
+                switched = operator.find_free_cells(velocity, LOOK)
+                settled, goal = not switched, least
+            self.residual(velocity)
             if switched:
-                self.residual(velocity, KEEP)
                 preconditioner.restrict()
         self._viscosity.multigrid.r.zero_()  # see `_launch_estimation`
         converged = relative <= self.tolerance

@@ -58,7 +58,7 @@ from warp_lcp.material.boundary import Boundary, CutBoundary
 from warp_lcp.rigid.bodies import RigidBodies
 
 NOISE = 1e-6  # of the largest pressure: smaller ones have no sign
-KEEP, LOOK, FIRST = range(3)  # whether `residual` determines the free cells, see `divergence`
+KEEP, LOOK, FIRST = range(3)  # how free cells are found, see the kernel `divergence`
 
 
 class StokesOperator:
@@ -318,26 +318,25 @@ class StokesOperator:
 
     # Residual
 
-    def residual(self, velocity: Sequence[wp.array], look: int, r: wp.array, work: wp.array) -> int:
-        """Write the residual of velocity and pressure, evaluated in float64.
+    def find_free_cells(self, velocity: Sequence[wp.array], look: int) -> int:
+        """Determine the free cells; set the pressure of the others to its bound.
 
         Args:
             velocity: u (updated on faces in walls that are partly open).
-            look: KEEP the free cells, LOOK for cells that change, or find the FIRST ones from x.
-            r: the residual, a vector.
-            work: another vector (overwritten).
+            look: LOOK for cells that change by the signs of x and y, or find the FIRST ones from x.
 
         Returns:
             The number of cells that have become free or fixed.
         """
         projection = self.projection
+        if look == LOOK and projection.lower is None:
+            return 0
         self._graphs["_launch_held"].run(velocity)
-        _, worst, most = self._divergence(velocity, look if look == FIRST else KEEP)
-        switched = 0.0
-        if look == LOOK and projection.lower is not None:
+        switched, worst, most = self._divergence(velocity, KEEP if look == LOOK else FIRST)
+        if look == LOOK:
             # Signs of outflows below the residual mean nothing.
             switched = self._divergence(velocity, LOOK, NOISE * most, worst)[0]
-        if look != KEEP and projection.lower is not None:
+        if projection.lower is not None and (switched or look == FIRST):
             self.window.run(
                 self.kernels.bound,
                 x=projection.pressure,
@@ -345,15 +344,26 @@ class StokesOperator:
                 kind=projection.kind,
                 free=self.free,
             )
+        return int(switched)
+
+    def residual(self, velocity: Sequence[wp.array], r: wp.array, work: wp.array) -> None:
+        """Write the residual of velocity and pressure, evaluated in float64.
+
+        Args:
+            velocity: u (updated on faces in walls that are partly open).
+            r: the residual, a vector.
+            work: another vector (overwritten).
+        """
+        self._graphs["_launch_held"].run(velocity)
+        self._graphs["_launch_divergence"].run(velocity, KEEP)
         self.viscous_force(velocity)
         self._graphs["_launch_residual"].run(velocity, r)
         if self.bodies is not None:
             for part, u in zip(self.layout.components(work), velocity, strict=True):
                 copy(part, u)
-            x = projection.pressure.flatten()
+            x = self.projection.pressure.flatten()
             rows = self.bodies.rows(self.bodies.velocities, work, x)
             self.layout.set_bodies(r, self.bodies.start - rows)
-        return int(switched)
 
     def _launch_held(self, velocity: Sequence[wp.array]) -> None:
         """Update the velocity of faces in walls that are partly open."""

@@ -13,7 +13,6 @@ import warp_lcp as wl
 from default_run import few
 from small_liquids import GRAVITY, box, create, scene
 from warp_lcp.fluids import LiquidScene, LiquidSimulation
-from warp_lcp.fluids.stokes_operator import KEEP
 from warp_lcp.operators.grid_poisson import FLUID
 
 ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
@@ -68,7 +67,7 @@ def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
     stokes.allocate()
     operator, residual = stokes.operator, stokes._preconditioner.r
     operator.free.assign((kind == FLUID).astype(np.uint8))
-    stokes.residual(simulation.velocity, KEEP)
+    stokes.residual(simulation.velocity)
     r = residual.numpy().astype(float)
     size = operator.layout.velocities.stop
     volume = np.concatenate([v.numpy().ravel() for v in operator.level.volume])
