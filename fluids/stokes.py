@@ -161,6 +161,7 @@ class StokesSolve:
             last = self._projection.last_kick
             self._ratio.value = kick_dt / last if last > 0.0 else 0.0
             copy(self._last_pressure, self._projection.pressure)
+            copy(self._last_cells, self._projection.cells)
 
     def keep_end(self, velocity: Sequence[wp.array]) -> None:
         """Store the velocity at the end of a coupled step, extrapolated into the air."""
@@ -241,6 +242,7 @@ class StokesSolve:
                 weight=weight,
                 at_once=self.operator.bodies is not None,
             )
+            self._last_cells = self._grid.field(wp.int8)
             self._split_pressure, self._last_pressure = (
                 self._grid.field(wp.float64) for _ in range(2)
             )
@@ -323,6 +325,7 @@ class StokesSolve:
             x=self._projection.pressure,
             other=self._last_pressure,
             kind=kind,
+            other_kind=self._last_cells,
             ratio=self._ratio,
         )
 

@@ -412,14 +412,14 @@ SIMD for (int i = first; i < last; ++i) out[i] = volume[i] > 0.0f ? a[i] - b[i] 
 //   box        float32 u, other, volume
 SIMD for (int i = first; i < last; ++i) u[i] = volume[i] > 0.0f ? other[i] : u[i];
 
-// kernel fluids.stokes.start_pressure: `ratio` times another pressure in FLUID cells, where that is
-// not 0
+// kernel fluids.stokes.start_pressure: `ratio` times another pressure in cells that are FLUID in
+// both kinds of cells
 //   compute    float64
-//   box        float64 x, other; int8 kind
+//   box        float64 x, other; int8 kind, other_kind
 //   numbers    float64 ratio
 //   constants  FLUID
 for (int i = first; i < last; ++i)
-    if (kind[i] == FLUID && other[i] != 0.0) x[i] = ratio * other[i];
+    if (kind[i] == FLUID && other_kind[i] == FLUID) x[i] = ratio * other[i];
 
 // kernel fluids.stokes.pressure_difference: Difference x - other in FLUID cells, else 0
 //   compute    float64
