@@ -45,6 +45,8 @@ TENTH = 0.1  # decrease of the residual after which the free cells are determine
 FLOOR = 1e-3
 # A solve that misses its tolerance is used if it has reduced the error of its start to this share.
 USEFUL = 0.5
+# Error of the last step as a start, relative to |u|_A, above which the split step is solved.
+FARTHEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,7 @@ class StokesSolve:
         self._krylov: FlexibleGMRES | None = None  # built, with its vectors, at the first use
         self.continues = False
         self._last = grid.faces()  # velocity at the end of the last coupled step
+        self._last_pressure, self._last_cells = grid.field(wp.float64), grid.field(wp.int8)
         self._last_bodies = np.zeros(self.operator.layout.rank)
         self._ratio = Scalar(1.0)  # of the times that forces act in this step and the last one
 
@@ -157,7 +160,6 @@ class StokesSolve:
         """Store u*, the velocity before viscosity and pressure, V*, and the last pressure."""
         self.operator.keep_start(velocity)
         if self.continues:
-            self.allocate()
             last = self._projection.last_kick
             self._ratio.value = kick_dt / last if last > 0.0 else 0.0
             copy(self._last_pressure, self._projection.pressure)
@@ -242,10 +244,7 @@ class StokesSolve:
                 weight=weight,
                 at_once=self.operator.bodies is not None,
             )
-            self._last_cells = self._grid.field(wp.int8)
-            self._split_pressure, self._last_pressure = (
-                self._grid.field(wp.float64) for _ in range(2)
-            )
+            self._split_pressure = self._grid.field(wp.float64)
         return self._krylov
 
     def residual(self, velocity: Sequence[wp.array]) -> None:
@@ -301,7 +300,7 @@ class StokesSolve:
         if operator.bodies is not None:
             operator.bodies.move(self._last_bodies - operator.bodies.velocities)
             moved()
-        result = self._iterate(velocity, 0.0, moved, farthest=1.0)
+        result = self._iterate(velocity, 0.0, moved, farthest=FARTHEST)
         if not result.used:
             return result
         error, size = self._splitting_error(), self._size(velocity)

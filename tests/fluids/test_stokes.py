@@ -12,7 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from default_run import few
 from small_liquids import GRAVITY, box, create, scene
-from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.fluids import LiquidScene, LiquidSimulation, stokes
 from warp_lcp.operators.grid_poisson import FLUID
 
 ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
@@ -62,12 +62,12 @@ class DenseStokesProblem:
 
 def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
     """Return the equations at the current velocity and pressure."""
-    stokes, projection = simulation.stokes, simulation.projection
+    solve, projection = simulation.stokes, simulation.projection
     kind = projection.kind.numpy()
-    stokes.allocate()
-    operator, residual = stokes.operator, stokes._preconditioner.r
+    solve.allocate()
+    operator, residual = solve.operator, solve._preconditioner.r
     operator.free.assign((kind == FLUID).astype(np.uint8))
-    stokes.residual(simulation.velocity)
+    solve.residual(simulation.velocity)
     r = residual.numpy().astype(float)
     size = operator.layout.velocities.stop
     volume = np.concatenate([v.numpy().ravel() for v in operator.level.volume])
@@ -267,3 +267,81 @@ def test_a_rod_sinks_at_the_speed_of_faxen_and_carries_its_weight() -> None:
     speed = sinking * walls / (4.0 * np.pi * 10.0)
     assert abs(-row["body0_vy"] / speed - 1.0) < 0.09
     assert abs(simulation.measured["forces"]["solid0_fy"] / weight - 1.0) < 0.02
+
+
+def pool(wall: str, viscosity: float, resolution: int = 24, **keys: Any) -> LiquidSimulation:
+    """Return a column of thick liquid that collapses."""
+    return create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=resolution,
+            wall=wall,
+            liquid=[box([0.0, 0.0], [0.5, 0.8])],
+            viscosity={"value": viscosity, "splitting_tolerance": 0.05},
+            **keys,
+        )
+    )
+
+
+def with_mass(simulation: LiquidSimulation) -> list[np.ndarray]:
+    """Return the velocities of the faces that are unknowns."""
+    volumes = simulation.stokes.operator.level.volume
+    pairs = zip(simulation.velocity, volumes, strict=True)
+    return [u.numpy()[volume.numpy() > 0.0] for u, volume in pairs]
+
+
+@pytest.mark.parametrize(("wall", "viscosity"), [("sticky", 1e3), ("separating", 1e5)])
+def test_a_start_from_the_last_step_has_the_result_of_one_from_the_split_step(
+    wall: str, viscosity: float
+) -> None:
+    simulations = pool(wall, viscosity), pool(wall, viscosity)
+    for _ in range(4):
+        simulations[1].stokes.continues = False
+        last, split = (simulation.step(0.02) for simulation in simulations)
+    assert last["viscous_iterations"] == 0 < split["viscous_iterations"]
+    assert 0 < last["stokes_iterations"] <= split["stokes_iterations"]
+    # An estimate of |u - u2|_V, at most twice the bound.
+    assert 0.05 < last["splitting_error"] <= 2.0 * split["splitting_error"]
+    for one, other in zip(*map(with_mass, simulations), strict=True):
+        assert np.abs(one - other).max() <= 1e-3 * max(np.abs(other).max(), 1e-12)
+
+
+def test_a_failed_start_from_the_last_step_is_followed_by_the_split_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    simulations = pool("sticky", 1e3), pool("sticky", 1e3)
+    for simulation in simulations:
+        simulation.step(0.02)
+    monkeypatch.setattr(stokes, "FARTHEST", 0.0)
+    simulations[1].stokes.continues = False
+    for simulation in simulations:
+        assert simulation.step(0.02)["viscous_iterations"] > 0
+    for one, other in zip(*(simulation.velocity for simulation in simulations), strict=True):
+        np.testing.assert_array_equal(one.numpy(), other.numpy())
+
+
+def test_thick_liquid_that_becomes_free_returns_to_the_split_step() -> None:
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=16,
+            liquid=[box([0.25, 0.5], [0.75, 1.0])],
+            viscosity={"value": 1e3, "splitting_tolerance": 0.05},
+        )
+    )
+    simulation.stokes.continues = True  # in free fall, nothing is wrong with the split step
+    assert simulation.step(0.02)["viscous_iterations"] == 0
+    assert not simulation.stokes.continues
+    assert simulation.step(0.02)["splitting_error"] < 1e-3
+
+
+def test_resumed_coupled_steps_have_the_same_bits() -> None:
+    first, second = pool("separating", 1e4), pool("separating", 1e4)
+    for _ in range(2):
+        first.step(0.02)
+    second.restore(first.state())
+    rows = [[simulation.step(0.02) for _ in range(2)] for simulation in (first, second)]
+    assert rows[0][0]["viscous_iterations"] == 0
+    assert rows[0] == rows[1]
+    for one, other in zip(first.velocity, second.velocity, strict=True):
+        np.testing.assert_array_equal(one.numpy(), other.numpy())
