@@ -442,9 +442,11 @@ class LiquidSimulation(ParticleSimulation):
         if self.viscosity is None:
             return self._project(window, dt, speed), {}
         self._keep_start(self.viscosity)
-        first, viscous, stokes = self._project(window, dt, speed), Row(), self.stokes
+        viscous, stokes = Row(), self.stokes
+        continues = stokes is not None and stokes.continues
+        first = self._project(window, dt, speed, measured=not continues)
         if first.result is not None:
-            if stokes is not None and stokes.continues:
+            if stokes is not None and continues:
                 projected, coupled = self._couple(stokes, first, window, dt, from_last=True)
                 if projected is not first:
                     nothing = dict(zip(VISCOUS_COLUMNS, (0, 0.0, 0.0, 0.0), strict=True))
@@ -586,12 +588,14 @@ class LiquidSimulation(ParticleSimulation):
             tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes
         ]
 
-    def _project(self, window: Window, dt: float, speed: float) -> Projection:
+    def _project(
+        self, window: Window, dt: float, speed: float, *, measured: bool = True
+    ) -> Projection:
         """Solve for the pressure and project the velocity.
 
         The bodies get the impulses of the pressure first, so that closed faces have the bodies' new
         velocities in the projection. Without unknowns, all liquid is spray and only the sources'
-        faces are set.
+        faces are set. `measured`: see `PressureProjection.solve`.
         """
         projection, watch = self.projection, self.watch
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
@@ -613,7 +617,7 @@ class LiquidSimulation(ParticleSimulation):
                 }
                 self.record(projection.recorded(speed) | clock)
         with watch.stage("pressure solve", *projection.fields()):
-            result, criteria = projection.solve(speed)
+            result, criteria = projection.solve(speed, measured=measured)
         # A GPU has not waited for the number of unknowns.
         if projection.counted() == 0:
             return self._held(projection.leave())
