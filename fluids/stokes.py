@@ -47,7 +47,7 @@ FLOOR = 1e-3
 USEFUL = 0.5
 # Steps begin with the last one until the estimated splitting error is below this share of its
 # tolerance. They do not alternate where the estimate is somewhat below the bound.
-CONTINUES = 0.5
+CONTINUES = 0.75
 # Error of the last step as a start, relative to |u|_A, above which the split step is solved.
 FARTHEST = 1.0
 
@@ -284,8 +284,8 @@ class StokesSolve:
 
         With x1 the pressure of the first projection, A (u - u2) = D'(x - x1) up to walls. One
         viscous cycle estimates |u - u2|_V, which is at most twice the bound of the split step, and
-        about 0.6 of it in pools; the next step begins likewise if it exceeds half of the splitting
-        tolerance.
+        about 0.6 of it in pools; the next step begins likewise if it exceeds three quarters of the
+        splitting tolerance.
 
         Args:
             velocity: velocity of the first projection, each component [m/s] (updated).
@@ -381,21 +381,23 @@ class StokesSolve:
         self.residual(velocity)
         preconditioner.restrict()
         settled, switched, iterations = self._projection.lower is None, 0, 0
-        first = before = math.inf
+        first = before = left = math.inf
+        begins = True  # a new space; otherwise the one before grows
         while True:
             error, size = preconditioner.estimate(), self._size(velocity)
             relative = error / size if size > 0.0 else 0.0
             first = min(first, relative)
-            stalled = relative > STALLED * before and not switched
+            stalled = begins and relative > STALLED * before and not switched
             done = relative <= self.tolerance or iterations >= self.max_iterations
             if done or stalled or not math.isfinite(relative) or first > farthest:
                 break
-            norm = krylov.begin()
-            least = min(0.5 * self.tolerance / relative, 0.5) * norm
-            goal, left, before, switched = least, math.inf, relative, 0
+            if begins:
+                left, before = krylov.begin(), relative
+            # The estimate of the error falls at least as fast as the norm, in most cases.
+            least, switched = min(self.tolerance / relative, 0.5) * left, 0
             while left > least and not switched and not krylov.full:
-                if not settled:  # the free cells are determined again in between
-                    goal = max(least, TENTH * norm)
+                # The free cells are determined again in between.
+                goal = least if settled else max(least, TENTH * left)
                 added, left = krylov.extend(goal)
                 iterations += added
                 self._corrections.run(velocity, krylov.x)
@@ -403,7 +405,8 @@ class StokesSolve:
                     operator.bodies.move(operator.layout.bodies(krylov.x))
                     moved()
                 switched = operator.find_free_cells(velocity, LOOK)
-                settled, goal = not switched, least
+                settled = not switched
+            begins = bool(switched) or krylov.full
             self.residual(velocity)
             if switched:
                 preconditioner.restrict()
