@@ -303,7 +303,7 @@ def test_a_start_from_the_last_step_has_the_result_of_one_from_the_split_step(
     # An estimate of |u - u2|_V, at most twice the bound.
     assert 0.05 < last["splitting_error"] <= 2.0 * split["splitting_error"]
     for one, other in zip(*map(with_mass, simulations), strict=True):
-        assert np.abs(one - other).max() <= 1e-3 * max(np.abs(other).max(), 1e-12)
+        assert np.abs(one - other).max() <= 3e-3 * max(np.abs(other).max(), 1e-12)
 
 
 def test_a_failed_start_from_the_last_step_is_followed_by_the_split_step(
@@ -345,3 +345,40 @@ def test_resumed_coupled_steps_have_the_same_bits() -> None:
     assert rows[0] == rows[1]
     for one, other in zip(first.velocity, second.velocity, strict=True):
         np.testing.assert_array_equal(one.numpy(), other.numpy())
+
+
+@pytest.mark.parametrize("resolution", few([16, 32], 1))
+def test_iterations_hardly_depend_on_viscosity_and_resolution(resolution: int) -> None:
+    counts = []
+    for tau in 1e-2, 1.0, 1e2, 1e4, 1e6:
+        simulation = create(
+            scene(
+                size=[1.0] * 3,
+                resolution=resolution,
+                wall="sticky",  # no contacts
+                liquid=[box([0.0] * 3, [0.5, 0.8, 0.8])],
+                viscosity={
+                    "value": tau * 1000.0 / resolution**2 / 0.02,
+                    "splitting_tolerance": ALWAYS,
+                },
+            )
+        )
+        result = coupled_from_split_step(simulation, 0.02)
+        assert result.converged
+        counts.append(result.iterations)
+    assert max(counts) <= 20
+
+
+def coupled_from_split_step(simulation: LiquidSimulation, dt: float) -> Any:
+    """Take a step with a coupled solve from the split step's result; return its result."""
+    found: list[Any] = []
+    solve = simulation.stokes
+
+    def watched(*arguments: Any) -> Any:
+        solve.operator.set_up(arguments[1])
+        found.append(solve.couple(arguments[0], np.inf, arguments[2]))
+        return found[0]
+
+    solve.solve = watched
+    simulation.step(dt)
+    return found[0]
