@@ -32,9 +32,9 @@ class FlexibleGMRES:
 
     The right-hand side is the preconditioner's field `r`, which is overwritten. All preconditioned
     vectors are stored, so that a solution needs no application of the preconditioner. The host
-    reads a column of H in each iteration; everything between is one recorded run, if possible. Vectors
-    are made orthogonal once: at residuals of 1e-4 of the start, rounding errors of 1e-7 per vector
-    do not count.
+    reads a column of H in each iteration; everything between is one recorded run, if possible.
+    Vectors are made orthogonal once: at residuals of 1e-4 of the start, rounding errors of 1e-7 per
+    vector do not count.
 
     The space can grow after its solution has been looked at, see `extend`.
 
