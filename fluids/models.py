@@ -65,6 +65,8 @@ class LiquidModel(Protocol):
         """
 
 
+# Error of a coupled solve, as a share of the splitting error that is tolerated.
+COUPLED_ACCURACY = 0.01
 VISCOUS_TOLERANCE = 1e-4  # used where the pressure's tolerance is derived from the time step
 
 
@@ -210,7 +212,7 @@ def make_stokes(
         projection,
         phi=surface.phi,
         splitting_tolerance=scene.viscosity.splitting_tolerance,
-        tolerance=viscosity.tolerance,
+        tolerance=max(viscosity.tolerance, COUPLED_ACCURACY * scene.viscosity.splitting_tolerance),
         density=scene.physics.density,
         bodies=bodies,
     )

@@ -444,11 +444,16 @@ class PressureProjection:
         for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
 
-    def solve(self, speed: float) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
+    def solve(
+        self, speed: float, *, measured: bool = True
+    ) -> tuple[wl.SolveResult, wl.StoppingCriteria]:
         """Solve the prepared problem for x without changing velocity or pressure.
 
         Args:
             speed: scale of u* [m/s].
+            measured: whether the change from the last pressure measures the time error of an
+                automatic tolerance. It does not if the last pressure balances viscous forces, and
+                this one does not.
 
         Returns:
             The result and its stopping criteria.
@@ -463,7 +468,7 @@ class PressureProjection:
                 self._problem, self.solver, stopping=mean, x0=self._guess, workspace=self._work
             )
         criteria = mean.known()
-        if self.automatic is not None and result:
+        if self.automatic is not None and result and measured:
             self.automatic.measure(
                 self._problem.A, result, criteria, [self._guess, self._rhs], self.counted()
             )
@@ -574,6 +579,11 @@ class PressureProjection:
             threshold=self._threshold,
         )
         self.grid.part.fill(*velocity, *self.known, self.contact)
+
+    @property
+    def last_kick(self) -> float:
+        """Time that forces acted in the last projection [s]; 0 before the first one."""
+        return self._last
 
     @property
     def lower(self) -> wp.array | None:

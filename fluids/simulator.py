@@ -217,15 +217,7 @@ class LiquidSimulation(ParticleSimulation):
         if self.projection.coupling is not None:
             with self.watch.stage("bodies"):
                 self.projection.coupling.take_along(self.velocity, self.projection.kind)
-        viscous = (
-            self._apply_viscosity(self.viscosity, window, dt, speed)
-            if self.viscosity is not None
-            else {}
-        )
-        projected = self._project(window, dt, speed)
-        if self.stokes is not None and viscous and projected.result is not None:
-            projected, coupled = self._couple(self.stokes, projected, window, dt)
-            viscous |= coupled
+        projected, viscous = self._solve_flow(window, dt, speed)
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
@@ -238,6 +230,8 @@ class LiquidSimulation(ParticleSimulation):
         )
         if self.projection.coupling is not None:
             self.projection.coupling.move_buried(self.velocity, self.projection.known)
+        if self.stokes is not None:
+            self.stokes.keep_end(self.velocity)
         self._measure()
         self.exchange(window, self.projection.kind, self.surface.phi, self.projection.contact)
         self.grid_to_particles(window, self.projection.kind, dt)
@@ -383,11 +377,14 @@ class LiquidSimulation(ParticleSimulation):
 
     def own_state(self) -> dict[str, np.ndarray]:
         """Return the state of the pressure: first guess of the next solve and frame data."""
-        return self.projection.state()
+        stokes = {} if self.stokes is None else self.stokes.state()
+        return self.projection.state() | stokes
 
     def restore_own(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore the arrays of `own_state`."""
         self.projection.restore(dict(state))
+        if self.stokes is not None:
+            self.stokes.restore(state)
 
     def _find_surface(self, window: Window) -> None:
         """Mark liquid cells, set their face velocities, and apply surface tension."""
@@ -421,25 +418,52 @@ class LiquidSimulation(ParticleSimulation):
         self._mark_cells(window)
         self.surface.complete(window, self.velocity, self.weights, self.projection.known)
 
+    def _solve_flow(self, window: Window, dt: float, speed: float) -> tuple[Projection, Row]:
+        """Apply viscosity and pressure, one after the other or at once.
+
+        Returns:
+            The projection of the step, and the log values of the viscous and the coupled solve.
+        """
+        if self.viscosity is None:
+            return self._project(window, dt, speed), {}
+        self._keep_start(self.viscosity)
+        viscous, stokes = Row(), self.stokes
+        continues = stokes is not None and stokes.continues
+        first = self._project(window, dt, speed, measured=not continues)
+        if first.result is not None:
+            if stokes is not None and continues:
+                projected, coupled = self._couple(stokes, first, window, dt, from_last=True)
+                if projected is not first:
+                    nothing = dict(zip(VISCOUS_COLUMNS, (0, 0.0, 0.0, 0.0), strict=True))
+                    return projected, nothing | coupled
+            viscous = self._apply_viscosity(self.viscosity, window, dt, speed)
+        projected = self._project(window, dt, speed)
+        if stokes is not None and viscous and projected.result is not None:
+            projected, coupled = self._couple(stokes, projected, window, dt)
+            viscous |= coupled
+        return projected, viscous
+
+    def _keep_start(self, viscosity: Viscosity) -> None:
+        """Store what the step begins with, before the first projection."""
+        viscosity.store_velocity(self.velocity)
+        if self.stokes is not None:
+            self.stokes.keep_start(self.velocity, self.kick_dt)
+            if self.forces is not None:
+                self._impulses_before = self.forces.impulses.copy()
+        bodies = [] if self.bodies is None else self.bodies.bodies
+        self._momenta_before = [body.momenta() for body in bodies]
+
     def _apply_viscosity(
         self, viscosity: Viscosity, window: Window, dt: float, speed: float
     ) -> Row:
-        """Apply viscosity before the pressure solve; return its log values.
+        """Apply viscosity after the first projection; return its log values.
 
-        A first pressure solve finds which walls hold the liquid: viscosity acts on the projected
+        The first pressure solve finds which walls hold the liquid: viscosity acts on the projected
         velocity. Its change is then added to the velocity before that projection, and the pressure
         is solved again. So the pressure balances viscous stresses too, and walls separate according
         to the sum of both.
         """
-        projection = self.projection
-        viscosity.store_velocity(self.velocity)
-        if self.stokes is not None:
-            self.stokes.keep_start(self.velocity)
-            if self.forces is not None:
-                self._impulses_before = self.forces.impulses.copy()
-        momenta = [] if self.bodies is None else [body.momenta() for body in self.bodies.bodies]
-        if self._project(window, dt, speed).result is None:
-            return {}
+        projection, momenta = self.projection, self._momenta_before
         self.extrapolate_velocity(window, projection.known, projection.kind, projection.contact)
         # A step much shorter than the last one, such as a retry, still has to make up for half of
         # that step: several solves, none stiffer than this step's own length requires.
@@ -489,12 +513,21 @@ class LiquidSimulation(ParticleSimulation):
         return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
 
     def _couple(
-        self, stokes: StokesSolve, projected: Projection, window: Window, dt: float
+        self,
+        stokes: StokesSolve,
+        projected: Projection,
+        window: Window,
+        dt: float,
+        *,
+        from_last: bool = False,
     ) -> tuple[Projection, Row]:
         """Solve for velocity and pressure at once if the split step is not accurate enough.
 
+        `from_last`: after the first projection, from the result of the last step.
+
         Returns:
-            The projection of the step, and its log values.
+            The projection of the step, which is `projected` if no coupled solve is used, and its
+            log values.
         """
 
         def moved() -> None:
@@ -503,7 +536,11 @@ class LiquidSimulation(ParticleSimulation):
 
         projection = self.projection
         with self.watch.stage("coupled solve", *self.velocity, projection.pressure):
-            result = stokes.solve(self.velocity, self.kick_dt, moved)
+            result = (
+                stokes.couple_from_last(self.velocity, window, self.kick_dt, moved)
+                if from_last
+                else stokes.solve(self.velocity, self.kick_dt, moved)
+            )
             if result.used:
                 assert projected.result is not None
                 if self.forces is not None and self.scene.output.forces:
@@ -536,12 +573,14 @@ class LiquidSimulation(ParticleSimulation):
             tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes
         ]
 
-    def _project(self, window: Window, dt: float, speed: float) -> Projection:
+    def _project(
+        self, window: Window, dt: float, speed: float, *, measured: bool = True
+    ) -> Projection:
         """Solve for the pressure and project the velocity.
 
         The bodies get the impulses of the pressure first, so that closed faces have the bodies' new
         velocities in the projection. Without unknowns, all liquid is spray and only the sources'
-        faces are set.
+        faces are set. `measured`: see `PressureProjection.solve`.
         """
         projection, watch = self.projection, self.watch
         with watch.stage("pressure set-up", *self.velocity, *projection.fields()):
@@ -563,7 +602,7 @@ class LiquidSimulation(ParticleSimulation):
                 }
                 self.record(projection.recorded(speed) | clock)
         with watch.stage("pressure solve", *projection.fields()):
-            result, criteria = projection.solve(speed)
+            result, criteria = projection.solve(speed, measured=measured)
         # A GPU has not waited for the number of unknowns.
         if projection.counted() == 0:
             return self._held(projection.leave())

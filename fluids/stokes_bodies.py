@@ -25,7 +25,7 @@ class StokesBodies:
         V - m (C'u - D V + U'x) = V*.
 
     Rows of velocities have -C V, those of outflows U V. A face in a body that is partly open moves
-    with it by its share, see `fluids.stokes`: U has it by this share, too.
+    with it by its share, see `fluids.stokes_operator`: U has it by this share, too.
 
     Args:
         grid: the grid.

@@ -46,6 +46,9 @@ class StokesKernels:
     velocity_correction: StencilKernel
     energy: StencilKernel
     difference: StencilKernel
+    start_velocity: StencilKernel
+    start_pressure: StencilKernel
+    pressure_difference: StencilKernel
     add_velocity: StencilKernel
     add_pressure: StencilKernel
 
@@ -88,6 +91,9 @@ def stokes_kernels(
         velocity_correction=kernel("velocity_correction"),
         energy=kernel("energy"),
         difference=kernel("difference"),
+        start_velocity=kernel("start_velocity"),
+        start_pressure=kernel("start_pressure"),
+        pressure_difference=kernel("pressure_difference"),
         add_velocity=kernel("add_velocity"),
         add_pressure=kernel("add_pressure"),
     )

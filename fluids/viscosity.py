@@ -290,7 +290,7 @@ class Viscosity:
                 self._fine, ViscousWalls(self._distance, self._slip, kind, contact), velocity
             )
             if self._bodies.moved:  # the recorded iteration has the old column addresses
-                self._solver = self._krylov()
+                self._solver, self._bodies.moved = self._krylov(), False
         first, lost, driven, stiff = self._force(fields, changed=False)
         norm, least, iterations = first, max(self.tolerance * first, ROUNDING * speed * stiff), 0
         while norm > least and iterations < self.max_iterations:
@@ -324,6 +324,26 @@ class Viscosity:
         return ViscousResult(
             iterations, residual, status, energy * (lost + driven), energy * driven
         )
+
+    def prepare(self, window: Window, kind: wp.array, contact: wp.array, dt: float) -> bool:
+        """Set up the equations of a step for another solve, without coarse levels.
+
+        Args:
+            window: see `solve`, like the other arguments.
+            kind: see `solve`.
+            contact: see `solve`.
+            dt: time that viscosity acts [s].
+
+        Returns:
+            Whether there are unknowns.
+        """
+        box, inner = self._boxes(window)
+        if inner is None:
+            return False
+        self._begin(box, inner, self._viscosity / self._density * dt / self.grid.spacing**2)
+        self._graphs["_set_up"].run(kind, contact, False, variant=(self._placed, False))
+        self._placed = True
+        return True
 
     def _begin(self, box: Window, inner: Window, tau: float) -> None:
         """Move the launches to a box, and the solve to the unknowns of its `inner` cells."""
@@ -511,12 +531,12 @@ class Viscosity:
         for u, kept, more in zip(velocity, self.before, self.change, strict=True):
             self.grid.everywhere.run(self._passes.sum, u=u, kept=kept, more=more)
 
-    def _set_up(self, kind: wp.array, contact: wp.array) -> None:
+    def _set_up(self, kind: wp.array, contact: wp.array, levels: bool = True) -> None:
         """Set up the equations of a step, with a change of 0.
 
         The order is: distances of faces from walls, which change only with moving walls; weights of
         the links, from the liquid fractions of cells and edges, tau and the viscosities; diagonals,
-        with the drag of walls; coarse levels.
+        with the drag of walls; coarse levels, if `levels`.
         """
         clear(self._change)
         fine, boundary, passes, planes = self._fine, self.boundary, self._passes, self.grid.planes
@@ -577,7 +597,8 @@ class Viscosity:
         if self.grid.barriers is not None:
             self._cut_links_at_thin_solids(kind, contact)
         self.set_diagonals(kind, contact)
-        self.multigrid.set_up()
+        if levels:
+            self.multigrid.set_up()
 
     def set_diagonals(self, kind: wp.array, contact: wp.array) -> None:
         """Compute the diagonals from the weights of the links, and which faces walls hold."""

@@ -212,7 +212,7 @@ class BodyDrag:
         comm: communicator; all methods are then collective. None if serial.
 
     Attributes:
-        moved: whether the arrays of the columns were reallocated since the last step.
+        moved: whether the arrays of the columns were reallocated; reset by who has recorded them.
         change: change of the bodies' velocities in the step so far.
     """
 
@@ -263,8 +263,8 @@ class BodyDrag:
             pulled, drags = found[:, 0], found[:, 1:]
         self._drag = drags
         count = len(self._pull.rows)
-        self.moved = count > self.columns.capacity
-        if self.moved:
+        if count > self.columns.capacity:
+            self.moved = True
             self.columns.reserve(round(SPARE * count))
         self.columns.assign(self._pull.rows, self._pull.blocks, self._pull.values)
         m = [self._scale * body.inverse_mass(dimension) for body in bodies]

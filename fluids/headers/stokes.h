@@ -395,6 +395,26 @@ power = power_sum;
 //   box        float32 out, a, b, volume
 SIMD for (int i = first; i < last; ++i) out[i] = volume[i] > 0.0f ? a[i] - b[i] : 0.0f;
 
+// kernel fluids.stokes.start_velocity: Take another velocity on faces with mass
+//   compute    float32
+//   box        float32 u, other, volume
+SIMD for (int i = first; i < last; ++i) u[i] = volume[i] > 0.0f ? other[i] : u[i];
+
+// kernel fluids.stokes.start_pressure: `ratio` times another pressure in cells that are FLUID in
+// both kinds of cells
+//   compute    float64
+//   box        float64 x, other; int8 kind, other_kind
+//   numbers    float64 ratio
+//   constants  FLUID
+for (int i = first; i < last; ++i)
+    if (kind[i] == FLUID && other_kind[i] == FLUID) x[i] = ratio * other[i];
+
+// kernel fluids.stokes.pressure_difference: Difference x - other in FLUID cells, else 0
+//   compute    float64
+//   box        float32 out; float64 x, other; int8 kind
+//   constants  FLUID
+for (int i = first; i < last; ++i) out[i] = kind[i] == FLUID ? (float)(x[i] - other[i]) : 0.0f;
+
 // kernel fluids.stokes.add_velocity: Add a correction to a velocity on faces with mass
 //   compute    float32
 //   box        float32 u, more, volume

@@ -12,7 +12,7 @@ import warp as wp
 import warp_lcp as wl
 from default_run import few
 from small_liquids import GRAVITY, box, create, scene
-from warp_lcp.fluids import LiquidScene, LiquidSimulation
+from warp_lcp.fluids import LiquidScene, LiquidSimulation, stokes
 from warp_lcp.fluids.stokes_kernels import stokes_kernels
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.window_reduction import WindowReduction
@@ -65,24 +65,25 @@ class DenseStokesProblem:
 
 def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
     """Return the equations at the current velocity and pressure."""
-    stokes, projection = simulation.stokes, simulation.projection
+    solve, projection = simulation.stokes, simulation.projection
     kind = projection.kind.numpy()
-    stokes._allocate()
-    stokes._free.assign((kind == FLUID).astype(np.uint8))
-    stokes._residual(simulation.velocity, 0)
-    r = stokes.r.numpy().astype(float)
-    size = stokes._size
-    volume = np.concatenate([v.numpy().ravel() for v in stokes._equations.level.volume])
+    solve.allocate()
+    operator, residual = solve.operator, solve._preconditioner.r
+    operator.free.assign((kind == FLUID).astype(np.uint8))
+    solve.residual(simulation.velocity)
+    r = residual.numpy().astype(float)
+    size = operator.layout.velocities.stop
+    volume = np.concatenate([v.numpy().ravel() for v in operator.level.volume])
     faces, cells = np.flatnonzero(volume > 0.0), np.flatnonzero(kind.ravel() == FLUID)
     columns = np.concatenate([faces, size + cells])
-    p, q = (wp.zeros(stokes.r.size, dtype=wp.float32, device="cpu") for _ in range(2))
+    p, q = (wp.zeros(residual.size, dtype=wp.float32, device="cpu") for _ in range(2))
     K = np.zeros((len(columns), len(columns)))
     for number, column in enumerate(columns):
         unit = np.zeros(p.size, dtype=np.float32)
         unit[column] = 1.0
         p.assign(unit)
         q.zero_()
-        stokes._product(p, q)
+        operator.product(p, q)
         K[:, number] = q.numpy()[columns]
     n = len(faces)
     lower = projection.lower
@@ -94,7 +95,7 @@ def dense(simulation: LiquidSimulation) -> DenseStokesProblem:
         D=-S[n:, :n],
         C=-S[n:, n:],
         r=r[columns[:n]],
-        y=stokes._outflows.numpy().ravel()[cells].astype(float),
+        y=operator.outflows.numpy().ravel()[cells].astype(float),
         room=room,
         asymmetry=float(np.abs(K - K.T).max() / np.abs(K).max()),
     )
@@ -108,7 +109,7 @@ def coupled_step(
     solve = simulation.stokes.solve
 
     def watched(*arguments: Any) -> Any:
-        simulation.stokes.set_up(arguments[1])
+        simulation.stokes.operator.set_up(arguments[1])
         found.append(dense(simulation))
         # The equations of the viscous solve are those of before again.
         found.append(simulation.stokes.couple(arguments[0], np.inf, arguments[2]))
@@ -363,3 +364,118 @@ def test_energies_are_sums_over_the_cells_of_the_window(dimension: int) -> None:
     kinetic = np.where(inside, volume * u.astype(np.float64) ** 2, 0.0)
     power = np.where(diagonal > 0.0, np.where(inside & (volume > 0.0), u * force, 0.0), kinetic)
     np.testing.assert_allclose(reduction.read(), [kinetic.sum(), power.sum()], rtol=1e-5)
+
+
+def pool(wall: str, viscosity: float, resolution: int = 24, **keys: Any) -> LiquidSimulation:
+    """Return a column of thick liquid that collapses."""
+    return create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=resolution,
+            wall=wall,
+            liquid=[box([0.0, 0.0], [0.5, 0.8])],
+            viscosity={"value": viscosity, "splitting_tolerance": 0.05},
+            **keys,
+        )
+    )
+
+
+def with_mass(simulation: LiquidSimulation) -> list[np.ndarray]:
+    """Return the velocities of the faces that are unknowns."""
+    volumes = simulation.stokes.operator.level.volume
+    pairs = zip(simulation.velocity, volumes, strict=True)
+    return [u.numpy()[volume.numpy() > 0.0] for u, volume in pairs]
+
+
+@pytest.mark.parametrize(("wall", "viscosity"), [("sticky", 1e3), ("separating", 1e5)])
+def test_a_start_from_the_last_step_has_the_result_of_one_from_the_split_step(
+    wall: str, viscosity: float
+) -> None:
+    simulations = pool(wall, viscosity), pool(wall, viscosity)
+    for _ in range(4):
+        simulations[1].stokes.continues = False
+        last, split = (simulation.step(0.02) for simulation in simulations)
+    assert last["viscous_iterations"] == 0 < split["viscous_iterations"]
+    assert 0 < last["stokes_iterations"] <= split["stokes_iterations"]
+    # An estimate of |u - u2|_V, at most twice the bound.
+    assert 0.05 < last["splitting_error"] <= 2.0 * split["splitting_error"]
+    for one, other in zip(*map(with_mass, simulations), strict=True):
+        assert np.abs(one - other).max() <= 3e-3 * max(np.abs(other).max(), 1e-12)
+
+
+def test_a_failed_start_from_the_last_step_is_followed_by_the_split_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    simulations = pool("sticky", 1e3), pool("sticky", 1e3)
+    for simulation in simulations:
+        simulation.step(0.02)
+    monkeypatch.setattr(stokes, "FARTHEST", 0.0)
+    simulations[1].stokes.continues = False
+    for simulation in simulations:
+        assert simulation.step(0.02)["viscous_iterations"] > 0
+    for one, other in zip(*(simulation.velocity for simulation in simulations), strict=True):
+        np.testing.assert_array_equal(one.numpy(), other.numpy())
+
+
+def test_thick_liquid_that_becomes_free_returns_to_the_split_step() -> None:
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=16,
+            liquid=[box([0.25, 0.5], [0.75, 1.0])],
+            viscosity={"value": 1e3, "splitting_tolerance": 0.05},
+        )
+    )
+    simulation.stokes.continues = True  # in free fall, nothing is wrong with the split step
+    assert simulation.step(0.02)["viscous_iterations"] == 0
+    assert not simulation.stokes.continues
+    assert simulation.step(0.02)["splitting_error"] < 1e-3
+
+
+def test_resumed_coupled_steps_have_the_same_bits() -> None:
+    first, second = pool("separating", 1e4), pool("separating", 1e4)
+    for _ in range(2):
+        first.step(0.02)
+    second.restore(first.state())
+    rows = [[simulation.step(0.02) for _ in range(2)] for simulation in (first, second)]
+    assert rows[0][0]["viscous_iterations"] == 0
+    assert rows[0] == rows[1]
+    for one, other in zip(first.velocity, second.velocity, strict=True):
+        np.testing.assert_array_equal(one.numpy(), other.numpy())
+
+
+@pytest.mark.parametrize("resolution", few([16, 32], 1))
+def test_iterations_hardly_depend_on_viscosity_and_resolution(resolution: int) -> None:
+    counts = []
+    for tau in 1e-2, 1.0, 1e2, 1e4, 1e6:
+        simulation = create(
+            scene(
+                size=[1.0] * 3,
+                resolution=resolution,
+                wall="sticky",  # no contacts
+                liquid=[box([0.0] * 3, [0.5, 0.8, 0.8])],
+                viscosity={
+                    "value": tau * 1000.0 / resolution**2 / 0.02,
+                    "splitting_tolerance": ALWAYS,
+                },
+            )
+        )
+        result = coupled_from_split_step(simulation, 0.02)
+        assert result.converged
+        counts.append(result.iterations)
+    assert max(counts) <= 20
+
+
+def coupled_from_split_step(simulation: LiquidSimulation, dt: float) -> Any:
+    """Take a step with a coupled solve from the split step's result; return its result."""
+    found: list[Any] = []
+    solve = simulation.stokes
+
+    def watched(*arguments: Any) -> Any:
+        solve.operator.set_up(arguments[1])
+        found.append(solve.couple(arguments[0], np.inf, arguments[2]))
+        return found[0]
+
+    solve.solve = watched
+    simulation.step(dt)
+    return found[0]

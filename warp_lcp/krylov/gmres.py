@@ -16,6 +16,7 @@ from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import ADD, RowReduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
+from warp_lcp.krylov.hessenberg import HessenbergLeastSquares
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
 RESIDUAL = KERNELS["gmres.residual"]
@@ -78,11 +79,7 @@ class GMRES:
             ]
             for function in (self._launch_before, self._launch_after, self._launch_end)
         )
-        self._H, self._rotations, self._g = (
-            np.zeros((restart + 1, restart)),
-            np.zeros((restart, 2)),
-            np.zeros(restart + 1),
-        )
+        self._problem = HessenbergLeastSquares(restart)
 
     def solve(self, tolerance: float, max_iterations: int) -> tuple[int, float]:
         """Iterate from x = 0 until the residual norm is at most the tolerance.
@@ -172,9 +169,8 @@ class GMRES:
         Arnoldi's process: v_k+1 is A M v_k, orthogonalized and normalized. Givens rotations keep H
         upper triangular; |g_k+1| is the norm of the residual.
         """
-        H, g = self._H, self._g
-        g[:] = 0.0
-        g[0] = norm
+        problem, H, g = self._problem, self._problem.H, self._problem.g
+        problem.begin(norm)
         for k in range(most):
             check_time()
             self._before[k].run()
@@ -192,7 +188,7 @@ class GMRES:
             found, products = self._sums.scalars.numpy(), self._products.numpy()
             H[: k + 1, k] = products[: k + 1] + found[: k + 1]
             H[k + 1, k] = np.sqrt(found[-1])
-            self._rotate(k)
+            problem.rotate(k)
             if not abs(g[k + 1]) > tolerance:  # also if it is NaN
                 return k + 1
         return most
@@ -242,32 +238,13 @@ class GMRES:
             last=self._restart + 1,
         ).launch()
 
-    def _rotate(self, k: int) -> None:
-        """Make column k of H upper triangular by the old rotations and a new one."""
-        H, g, rotations = self._H, self._g, self._rotations
-        for i in range(k):
-            c, s = rotations[i]
-            H[i, k], H[i + 1, k] = c * H[i, k] + s * H[i + 1, k], c * H[i + 1, k] - s * H[i, k]
-        length = math.hypot(H[k, k], H[k + 1, k])
-        c, s = (H[k, k] / length, H[k + 1, k] / length) if length > 0 else (1.0, 0.0)
-        rotations[k] = c, s
-        H[k, k], H[k + 1, k] = length, 0.0
-        g[k], g[k + 1] = c * g[k], -s * g[k]
-
     def _correct(self, columns: int) -> None:
         """Compute x += M V y with H y = g.
 
         Columns of H that are singular to rounding are omitted. For few columns the stored images M
         v_j are used.
         """
-        # Back substitution with the triangle H.
-        H, g = self._H[:columns, :columns], self._g
-        y = np.zeros(self._restart + 1)
-        largest = float(np.abs(np.diag(H)).max(initial=0.0))
-        for k in reversed(range(columns)):
-            if abs(H[k, k]) > 1e-14 * largest:
-                y[k] = (g[k] - H[k, k + 1 :] @ y[k + 1 : columns]) / H[k, k]
-        self._factors.assign(y)
+        self._factors.assign(self._problem.solve(columns))
         self._ends[columns].run()
         if columns > KEPT:  # x += M (V y), with one more application of M
             self._preconditioner.apply()

@@ -64,6 +64,40 @@ if (inverse) {
     SIMD for (int k = 0; k < n; ++k) q[k] *= sqrt(w[k]);
 }
 
+// kernel gmres.weighed: q = w^(1/2) r; q'q
+//   compute    S
+//   reads      S r, w
+//   writes     S q
+//   sums       qq
+double qq = 0;
+SIMD for (int k = 0; k < n; ++k) {
+    q[k] = sqrt(w[k]) * r[k];
+    qq += (double)q[k] * q[k];
+}
+
+// kernel gmres.load: r = w^(-1/2) times a field of a basis
+//   compute    S
+//   reads      S w
+//   writes     S r
+//   whole      S basis
+//   numbers    int64 size, place
+//   by_cell
+const auto* v = basis + place * size + p;
+SIMD for (int k = 0; k < n; ++k) r[k] = w[k] > 0 ? v[k] / sqrt(w[k]) : 0;
+
+// kernel gmres.keep: Store z as a field of a basis; q = w^(1/2) q
+//   compute    S
+//   reads      S w, z
+//   writes     S q
+//   whole      S basis
+//   numbers    int64 size, place
+//   by_cell
+auto* v = basis + place * size + p;
+SIMD for (int k = 0; k < n; ++k) {
+    v[k] = z[k];
+    q[k] *= sqrt(w[k]);
+}
+
 // kernel gmres.dots: Products v_j'x of the first fields of a basis with x, a column of sums each
 //   compute    S
 //   reads      S x

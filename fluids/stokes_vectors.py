@@ -1,0 +1,81 @@
+"""Vectors of the coupled solve: velocities, pressures, and velocities of rigid bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
+from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.grid.window_reduction import WindowReduction
+from warp_lcp.kernels import StencilKernel
+
+
+class StokesLayout:
+    """Parts of a vector of the coupled solve, see `fluids.stokes_operator`.
+
+    Velocities of all components, x of all cells, and the velocities of rigid bodies.
+
+    Args:
+        grid: the grid.
+        multigrid: the viscous multigrid, whose vectors hold the velocities.
+        rank: number of unknowns of bodies.
+
+    Attributes:
+        size: number of elements.
+        rank: number of unknowns of bodies.
+        velocities: the part of the velocities.
+    """
+
+    def __init__(self, grid: StaggeredGrid, multigrid: ViscosityMultigrid, rank: int) -> None:
+        self._grid, self._multigrid = grid, multigrid
+        first = grid.dimension * grid.size
+        self.size, self.rank = first + grid.size + rank, rank
+        self.velocities = slice(0, first)
+        self._pressures = slice(first, first + grid.size)
+        self._bodies = slice(first + grid.size, self.size)
+
+    def components(self, vector: wp.array) -> list[wp.array]:
+        """Return the velocities, of each component in the stored shape."""
+        return self._multigrid.components(vector)
+
+    def flat_pressure(self, vector: wp.array) -> wp.array:
+        """Return x, a flat field."""
+        return vector[self._pressures]
+
+    def pressure(self, vector: wp.array) -> wp.array:
+        """Return x in the stored shape."""
+        return self.flat_pressure(vector).reshape(self._grid.shape)
+
+    def bodies(self, vector: wp.array) -> np.ndarray:
+        """Return the velocities of the bodies, a copy."""
+        return np.array(vector[self._bodies].numpy(), dtype=np.float64)
+
+    def set_bodies(self, vector: wp.array, values: np.ndarray) -> None:
+        """Store the velocities of the bodies."""
+        vector[self._bodies].assign(values.astype(np.float32))
+
+
+class WindowSums:
+    """Reductions of a kernel that runs once, or once for each component.
+
+    Args:
+        kernel: the kernel.
+        grid: the grid.
+        parts: number of its launches.
+    """
+
+    def __init__(self, kernel: StencilKernel, grid: StaggeredGrid, parts: int = 1) -> None:
+        self._parts = [WindowReduction(kernel, grid) for _ in range(parts)]
+
+    def take(self, window: Window, part: int = 0, **arguments: object) -> None:
+        """Launch a part over a window."""
+        self._parts[part].take(window, **arguments)
+
+    def read(self) -> Sequence[float]:
+        """Return the results of the last launches, summed over the parts."""
+        for part in self._parts:
+            part.changed()
+        return [float(v) for v in np.sum([part.read() for part in self._parts], axis=0)]

@@ -1,0 +1,192 @@
+"""GMRES that stores preconditioned vectors and can go on after a look at its result."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import warp as wp
+
+from warp_lcp.deadline import check_time
+from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.fields import zeros, zeros_like
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear
+from warp_lcp.kernels.recorded_arguments import Scalar
+from warp_lcp.kernels.types import DeviceArray
+from warp_lcp.kernels.vectors import RowReduction, rows_of
+from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
+from warp_lcp.krylov.hessenberg import HessenbergLeastSquares
+
+KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
+DOTS = KERNELS["gmres.dots"]
+COMBINE = KERNELS["gmres.combine"]
+STORE = KERNELS["gmres.store"]
+WEIGHED = KERNELS["gmres.weighed"]
+LOAD = KERNELS["gmres.load"]
+KEEP = KERNELS["gmres.keep"]
+
+
+class FlexibleGMRES:
+    """Right-preconditioned GMRES in float32 for loose tolerances (Saad 1993).
+
+    The right-hand side is the preconditioner's field `r`, which is overwritten. All preconditioned
+    vectors are stored, so that a solution needs no application of the preconditioner. The host
+    reads a column of H in each iteration; everything between is one recorded run, if possible.
+    Vectors are made orthogonal once: at residuals of 1e-4 of the start, rounding errors of 1e-7 per
+    vector do not count.
+
+    The space can grow after its solution has been looked at, see `extend`.
+
+    Args:
+        product: A.
+        preconditioner: M, an approximation of A's inverse.
+        restart: the most vectors.
+        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0.
+        at_once: whether A or M have tasks of the host, and are launched in each run.
+
+    Attributes:
+        x: the change of the solution by the last `extend`.
+        columns: number of vectors.
+    """
+
+    def __init__(
+        self,
+        product: LinearMap,
+        preconditioner: KrylovPreconditioner,
+        *,
+        restart: int,
+        weight: DeviceArray,
+        at_once: bool = False,
+    ) -> None:
+        r, size = preconditioner.r, preconditioner.r.size
+        self._product, self._preconditioner, self._restart = product, preconditioner, restart
+        self.x, self._q, self._weight = zeros_like(r), zeros_like(r), weight
+        self._basis = zeros((restart + 1) * size, r.dtype, r.device)  # fields, one after another
+        self._images = zeros(restart * size, r.dtype, r.device)  # the same, preconditioned
+        # Products with them, and a square in the last slot.
+        self._sums = RowReduction(rows_of(r), restart + 1, slots=restart + 2)
+        self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
+        self._problem = HessenbergLeastSquares(restart)
+        self._place, self._next = Scalar(0), Scalar(1)  # k, and k + 1
+        self._y, self.columns = np.zeros(restart + 1), 0
+        at_once = at_once or r.device.is_cuda
+        self._first = LaunchGraph(r.device, self._launch_first, at_once=r.device.is_cuda)
+        self._before = LaunchGraph(r.device, self._launch_before, at_once=at_once)
+        self._after = LaunchGraph(r.device, self._launch_after, at_once=at_once)
+        self._end = LaunchGraph(r.device, self._launch_end, at_once=r.device.is_cuda)
+
+    @property
+    def full(self) -> bool:
+        """Whether there is no room for another vector."""
+        return self.columns == self._restart
+
+    def begin(self) -> float:
+        """Begin a space with the residual r, whose image z is known; return the norm."""
+        self.columns = 0
+        self._y[:] = 0.0
+        self._first.run()
+        norm = float(np.sqrt(self._sums.reading.numpy()[self._restart + 1]))
+        self._problem.begin(norm)
+        return norm
+
+    def extend(self, tolerance: float) -> tuple[int, float]:
+        """Add vectors until the estimate of the residual is at most the tolerance.
+
+        `x` is then the change of the solution.
+
+        Returns:
+            The number of vectors added, and the estimate.
+        """
+        problem, first = self._problem, self.columns
+        while not self.full:
+            check_time()
+            k = self.columns
+            self._place.value, self._next.value = k, k + 1
+            if k:
+                self._before.run()
+            self._after.run()
+            self._sums.reading.changed()
+            found = self._sums.reading.numpy()
+            problem.H[: k + 1, k] = found[: k + 1]
+            problem.H[k + 1, k] = np.sqrt(found[-1])
+            problem.rotate(k)
+            self.columns = k + 1
+            if not abs(problem.g[k + 1]) > tolerance:  # also if it is NaN
+                break
+        y = problem.solve(self.columns)
+        self._factors.assign(y - self._y)
+        self._y = y
+        self._next.value = self.columns
+        self._end.run()
+        left = float(abs(problem.g[self.columns]))
+        return self.columns - first, left if math.isfinite(left) else math.inf
+
+    def _launch_first(self) -> None:
+        """Store the normalized residual as the first vector; scale its image."""
+        r = self._preconditioner.r
+        self._sums.launch(WEIGHED, slot=self._restart + 1, r=r, w=self._weight, q=self._q)
+        self._store(0, self._basis, self._q)
+        self._store(0, self._preconditioner.z, self._preconditioner.z)
+
+    def _launch_before(self) -> None:
+        """Write W^(-1/2) v_k to the preconditioner, and apply it."""
+        r = self._preconditioner.r
+        LOAD.bind(
+            rows_of(r), basis=self._basis, size=r.size, place=self._place, w=self._weight, r=r
+        ).launch()
+        self._preconditioner.apply()
+
+    def _launch_after(self) -> None:
+        """Store the image z; orthogonalize w = W^(1/2) A z against the vectors, and store it."""
+        q, z = self._q, self._preconditioner.z
+        self._product(z, q)
+        KEEP.bind(
+            rows_of(q), basis=self._images, size=q.size, place=self._place, w=self._weight, z=z, q=q
+        ).launch()
+        DOTS.bind(
+            rows_of(q),
+            basis=self._basis,
+            size=q.size,
+            count=self._next,
+            x=q,
+            out=self._sums.partials,
+        ).launch()
+        self._sums.add_up(0, columns=self._restart + 1)
+        self._sums.launch(
+            COMBINE,
+            slot=self._restart + 1,
+            basis=self._basis,
+            size=q.size,
+            factors=self._sums.scalars,
+            x=q,
+            count=self._next,
+            sign=-1.0,
+        )
+        self._store(self._next, self._basis, q)
+
+    def _launch_end(self) -> None:
+        """Write the sum of factors_j M v_j to x."""
+        clear(self.x)
+        self._sums.launch(
+            COMBINE,
+            slot=self._restart + 1,
+            basis=self._images,
+            size=self.x.size,
+            factors=self._factors,
+            x=self.x,
+            count=self._next,
+            sign=1.0,
+        )
+
+    def _store(self, place: int | Scalar, basis: DeviceArray, x: DeviceArray) -> None:
+        """Store a field, divided by the norm in the last slot, in a basis."""
+        STORE.bind(
+            rows_of(x),
+            basis=basis,
+            size=x.size,
+            place=place,
+            sums=self._sums.scalars,
+            x=x,
+            last=self._restart + 1,
+        ).launch()
