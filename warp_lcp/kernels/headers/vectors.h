@@ -21,9 +21,9 @@ if (stride == 1) {
 } else {
     int i = start;
     // Eight loads at a time, so that a thread of a GPU waits once for all; added in their order.
-    for (; i + 7*(long long)stride < n; i += 8*stride) {
+    for (; i + 7 * (long long)stride < n; i += 8 * stride) {
         double a[8];
-        for (int k = 0; k < 8; ++k) a[k] = v[i + k*stride];
+        for (int k = 0; k < 8; ++k) a[k] = v[i + k * stride];
         for (int k = 0; k < 8; ++k) s += a[k];
     }
     for (; i < n; i += stride) s += v[i];
