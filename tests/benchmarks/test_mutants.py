@@ -130,6 +130,7 @@ def test_modules_of_a_simulator_have_the_tests_of_their_users():
     users = users_of(ROOT)["fluids/viscosity_level.py"]
     assert users == {
         "fluids/stokes_bodies.py",
+        "fluids/stokes_operator.py",
         "fluids/viscosity.py",
         "fluids/viscosity_bodies.py",
         "fluids/viscosity_multigrid.py",
