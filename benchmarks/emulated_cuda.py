@@ -153,11 +153,9 @@ def emulate_kernels():
         ("        block_first += (size_t)active_count;\n", ""),
     )
     wp.config.enable_cpu_blocks = True
-    # Kernels run on small grids. They are compiled in 70 % of the usual time and run as fast.
-    wp.config.optimization_level = 1
-    # A cache folder of its own, since Warp does not hash templates.
     # Kernels run once or twice on small grids: compiling them well takes longer than it saves.
     wp.config.optimization_level = 0
+    # A cache folder of its own, since Warp does not hash templates.
     wp.config.kernel_cache_dir = str(Path(__file__).parents[1] / "build" / "emulated-cuda")
 
 
