@@ -187,7 +187,7 @@ def test_a_plain_preconditioner_is_not_enough(device):
         work = wl.ProjectedMultigrid().init(problem)
         assert isinstance(work, CoupledWorkspace)
         if not corrected:
-            work.correction.renew = lambda begins, noted, made: False  # type: ignore[method-assign]
+            work.correction.renew = lambda begins, noted, has_potentials: False  # type: ignore[method-assign]
         result = wl.solve(
             problem,
             wl.ProjectedMultigrid(),
