@@ -236,6 +236,7 @@ class BodyDrag:
         )
         self.columns.comm = comm
         rank = self.columns.rank
+        self.moved = False
         self._response = wp.zeros((rank, rank), dtype=wp.float64, device=grid.device)
         self._factors = wp.zeros(rank, dtype=wp.float64, device=grid.device)
 

@@ -20,6 +20,7 @@ from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 
 CELLS = {
+    "hourglass": 20,
     "jet": 128,
     "river": 256,
     "mesh-obstacle": 30,
