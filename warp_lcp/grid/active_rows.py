@@ -52,7 +52,12 @@ class ActiveRows:
             self._copy_segments(before)
 
     def _copy_segments(self, other: "ActiveRows") -> None:
-        """Copy the segments that another object has found."""
+        """Copy the segments that another object has found.
+
+        With the shift between the two origins, in cells along z and y and in segments along x,
+        marks[p + shift] = marks_other[p] wherever both objects store the segment. Other marks are
+        0.
+        """
         if other._now is None:
             return
         shift = np.array(other.grid.origin) - self.grid.origin

@@ -60,7 +60,12 @@ def near_kernel(k, j, i, B: Barrier, near: U8):
 
 @wp.func
 def mesh_around(B: Barrier, x: wp.vec3):
-    """Return the number of the solid whose mesh a point lies in, 0 if it lies in none."""
+    """Return the number of the solid whose mesh a point lies in, 0 if it lies in none.
+
+    x is in m. In the frame of a group, p = R'(x - shift); in the mesh's own units, q = turn (p -
+    shift) / radius. A point lies in a mesh where the winding number exceeds 1/2. Where meshes
+    overlap, the last one counts.
+    """
     result = int(0)
     for g in range(B.groups.shape[0]):
         group = B.groups[g]
@@ -353,6 +358,15 @@ def edge_kernel(
     - A solid goes on beside the two cells of a face that is open: the face reaches as far as the
       solid (`open_width`), since the part of the next cell before the solid belongs to these cells.
       The fraction is then up to 1.5 along each axis.
+
+    Where the solid goes on, with the widths w [cells] of `open_width` on the two sides of the
+    center, and the product over the axes d of the face:
+
+        open = max(prod_d (w_d,lower + w_d,upper), LEAST_OPEN).
+
+    Otherwise open is the free share of `samples`^(dimension - 1) lines; on a crossed face it is 0
+    if the share is below LEAST_OPEN. `sight` stores the mean place of the free lines of a crossed
+    face: lines of sight end there.
     """
     code = wp.uint8(0)
     inside = i > 0 and j > 0 and i + 1 < open.shape[2] and j + 1 < open.shape[1]
@@ -444,6 +458,10 @@ def gap_kernel(k, j, i, B: Barrier, axis: int, open: F32, number: I16, gaps: INT
     """Count the crossed faces of each solid that are beside a gap.
 
     A face has a gap if the way beside its center is free although the next face is closed as well.
+
+    With the centers x and y of the two cells [m], four shifts s along each axis of the face are
+    tried: 0.2 and 0.4 cells to either side. The way is free if each of the lines x -> x + s -> y +
+    s -> y is.
     """
     if number[k, j, i] > wp.int16(0) and open[k, j, i] == 0.0:
         y = place_of(B, CENTERS, k, j, i)
@@ -490,6 +508,13 @@ def ray_share_kernel(k, j, i, B: Barrier, rays: int, share: F32):
     What the center sees is star-shaped. So the kernel is integrated along rays, each up to the
     first solid: `rays` per edge of each side of the kernel's support, which is 3 cells wide. The
     share is then smooth in the distance of a wall; with points that are seen or not it had steps.
+
+    With the quadratic B-spline B, a ray (x, y, z) [cells] and the place t <= 1 of the first solid
+    on it, `kernel_along` returns in dimension d
+
+        F(t) = integral of s^(d - 1) B(s x) B(s y) B(s z) over s from 0 to t,
+
+    and share = sum of F(t) / sum of F(1) over the rays; in 2-D there is no factor of z.
     """
     result = float(1.0)
     if B.near[k, j, i] != wp.uint8(0):

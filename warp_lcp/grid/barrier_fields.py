@@ -15,6 +15,10 @@ def free_path(apart: U8, k: int, j: int, i: int, dk: int, dj: int, di: int):
 
     The neighbor is at most a cell away on each axis. Some path of steps along the axes must be
     free: the two cells are then on the same side of every solid that is longer than a cell.
+
+    Bit d of `apart` is 1 where a thin solid separates a cell from its lower neighbor along axis d.
+    A step along d is free if this bit of the upper one of its two cells is 0. All 6 orders of the
+    axes are tried.
     """
     found = bool(False)
     for n in range(6):  # orders of the axes
@@ -120,6 +124,13 @@ def shift_kernel(
     Only values on the cell's own side are used.
 
     See `warp_lcp.grid.level_set_kernels.wall_shift_kernel`.
+
+    The equation, in cells, with the kernel's capacity c:
+
+        phi <- phi - s . grad(phi),   s = variance grad(c) / max(c, 1e-3).
+
+    Both vectors are limited to length 1. Beyond a solid c counts as that of the cell itself, and
+    slopes of phi are one-sided.
     """
     one = wp.int8(1)
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):

@@ -38,7 +38,15 @@ VEC8 = wp.types.vector(length=8, dtype=wp.float32)
 
 @cell_kernel(MODULE)
 def density_kernel(k, j, i, B: Barrier, each: float, offsets: INTS, position: POINTS, density: F32):
-    """Add up the particles around a cell that its center sees."""
+    """Add up the particles around a cell that its center sees.
+
+    With d = (x_p - x) / dx for a particle at x_p and the center x [m], and the quadratic B-spline
+    B:
+
+        density = each * sum_p B(d_x) B(d_y) B(d_z),
+
+    in 2-D without the factor of z. `each` is the share of one particle of the density at rest.
+    """
     if B.near[k, j, i] != wp.uint8(0):
         center = place_of(B, CENTERS, k, j, i)
         # Lines shorter than this [cells] are free; tests take most of the time.
@@ -92,7 +100,15 @@ def gather_kernel(
     field: F32,
     weight: F32,
 ):
-    """Average the velocities of the particles that a face sees around it."""
+    """Average the velocities of the particles that a face sees around it.
+
+    With tent weights w_p, the particles' velocities v_p [m/s] and the gradients c_p [1/s] of the
+    component (APIC; 0 without `gradient`), at the face's center x [m]:
+
+        u = sum_p w_p (v_p + c_p . (x - x_p)) / sum_p w_p.
+
+    u is 0 where the sum of the weights is at most TINY_WEIGHT.
+    """
     if B.near[k, j, i] != wp.uint8(0):
         face = place_of(B, axis, k, j, i)
         seen_at = sight_of(B, axis, k, j, i)
@@ -227,6 +243,14 @@ def interpolate_kernel(
     Only particles near thin solids are considered.
 
     See `warp_lcp.grid.transfer`.
+
+    With multilinear weights w_i of the faces around a particle, and the field u_saved before the
+    step, the component v [m/s] and its gradient c [1/s] are
+
+        v = sum_i w_i u_i + flip (v_before - sum_i w_i u_saved,i),   c = sum_i grad(w_i) u_i.
+
+    Faces that the particle does not see have the mean of the others. A particle that sees no face
+    keeps its component and gradient.
     """
     x = position[i]
     c, b, a = cell_at(B, x, shape_of(B.near))
@@ -288,6 +312,13 @@ def carry_kernel(
     Particles far from these solids are left out. The velocity is that of the midpoint of their
     path, if the midpoint is between `low` and `high`, the corners of the domain. Particles stop at
     `least` and `most`: these corners or, where sides let particles pass, infinity.
+
+    The midpoint rule, with x [m], v [m/s] and dt [s]:
+
+        x <- x + dt v(y),   y = x + (dt / 2) v(x).
+
+    y = x if the midpoint lies outside of the domain, or if the particle does not see it. Particles
+    within FREE cells of other solids are left out, too.
     """
     x = start[i]
     c, b, a = cell_at(B, x, shape_of(B.near))

@@ -84,6 +84,14 @@ def constrain_kernel(
     A face loses the relative velocity into its wall; where the wall holds the material it loses all
     relative velocity along the normal. A crossed face lies on one side of the wall, and only places
     on that side see it. A face that is open in part has been projected and keeps its velocity.
+
+    With the velocity u of the material, the velocity u_s = turn x + shift of the solid at the
+    face's center x, both in m/s, the wall's normal n towards the face and the face's axis a:
+
+        u_a <- u_a - (n . (u - u_s)) n_a   if the wall holds the material or n . (u - u_s) < 0.
+
+    The other components of u are means over the faces that this one sees. A face without a known
+    velocity gets that of the solid.
     """
     if number[k, j, i] > wp.int16(0) and open[k, j, i] == 0.0:
         own = of_axis(axis, U.u, U.v, U.w, k, j, i)

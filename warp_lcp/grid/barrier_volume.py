@@ -61,6 +61,13 @@ def filled_kernel(
     its neighbors, that it sees. It is filled where phi, linear about that center, is negative. A
     part of a cell that lies beyond a thin solid so is filled as the cells on its own side are.
     Points that see no center are empty.
+
+    With phi and the distance d from thick solids, both in cells, at the sample points:
+
+        filled = mean of clip(1/2 - SHARP phi, 0, 1) clip(1/2 + SHARP d, 0, 1).
+
+    The second factor is 1 without thick solids (`has_nodes`). The cell's own center is tested
+    first: no center is nearer to its points.
     """
     share = float(-1.0)
     x = place_of(B, CENTERS, k, j, i)

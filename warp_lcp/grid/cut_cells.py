@@ -403,7 +403,12 @@ class CutCells:
                 self._sampler.enter(self._nodes, self._moving[run], geometries[run])
 
     def _join(self) -> None:
-        """Fill distances and marks beyond cut periodic sides from the ranks there."""
+        """Fill distances and marks beyond cut periodic sides from the ranks there.
+
+        With the distances d of this part [cells] and the received ones d', the difference of an
+        axis is the largest |clip(d, -CLOSE, CLOSE) - clip(d', -CLOSE, CLOSE)| over the domain's
+        upper side.
+        """
         part, near = self.grid.part, self._nodes.near
         if not part.joined:
             return

@@ -84,6 +84,10 @@ def side_kernel(
     """Fill the open fractions and wall numbers of faces on an open side of the domain.
 
     Count the dropped and the partial faces.
+
+    The open fraction, of the face's area, is 0 or at least DROP. counts[0] += 1 for each dropped
+    face, counts[1] += 1 for each partial one. The wall is the solid that is nearest to a corner of
+    the face, -1 if the face is open.
     """
     free = open_face(near, axis, planes, k, j, i)
     if free > 0.0 and free < DROP:
@@ -140,6 +144,12 @@ def moving_part(
     The number is 0 if no moving solid covers it. The part that standing solids cover is at rest. So
     is a face of the domain but for the part that a moving solid covers: of a piston that slides
     over a floor, the part above the floor displaces liquid.
+
+    With the open fractions f among all solids and f_s among standing ones:
+
+        part = clip((1 - f - (1 - f_s)) / closed, 0, 1),
+
+    where closed = 1 - f, and 1 on a face of the domain, which is closed as a whole.
     """
     free = open[k, j, i]
     solid = int(0)
@@ -268,7 +278,12 @@ def cut_in_order_kernel(
     state: I8,
     capacity: F32,
 ):
-    """Integrate over the cut cells of a box, color after color, on one thread."""
+    """Integrate over the cut cells of a box, color after color, on one thread.
+
+    A cell (x, y, z) of the domain has the color (x mod 3, y mod 3, z mod 3), whatever the `origin`
+    of its part. `cut_cell` adds to the neighbors of its cell. The order is that of `cut_kernel`,
+    which visits one color at a time.
+    """
     colors = COLORS * COLORS
     if planes == 2:
         colors = colors * COLORS

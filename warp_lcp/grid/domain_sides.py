@@ -294,6 +294,12 @@ def average_kernel(count: int, weight: F32, field: F32, saved: F32):
     """Merge the two ends of a line into the faces that they repeat.
 
     The result is the mean weighted by particles.
+
+    With the weights w and values f of a face and of its repeated one:
+
+        f <- (w f + w_ring f_ring) / (w + w_ring),   w <- w + w_ring,   w_ring <- 0.
+
+    Index 0 of a line repeats `count`, and count + 1 repeats 1.
     """
     a, b = wp.tid()
     for end in range(2):
@@ -318,6 +324,10 @@ def carry_kernel(
     """Wrap positions into the domain, at a distance from its very end.
 
     A particle that has crossed keeps off the walls; beyond the side none stopped it.
+
+    Along each periodic axis of length L, in m: x <- x + L for x < 0 and x <- x - L for x >= L. A
+    particle within END cells of the upper end is moved to the nearest of L - END cells and 0. The
+    other axes of a particle that has crossed are clipped to [MARGIN, L - MARGIN] cells.
     """
     p = wp.tid()
     x = position[p]

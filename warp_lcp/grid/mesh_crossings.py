@@ -81,6 +81,9 @@ def cut_by_plane(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, h: wp.vec3d, along: wp.v
 
     `h` are the heights of its corners above the plane. Returns the first and the last point along
     the direction `along`, and the number of points.
+
+    An edge from p to q with heights h_p h_q < 0 meets the plane at x = p + (q - p) h_p / (h_p -
+    h_q); a corner of height 0 is a point itself.
     """
     low = a
     high = a
@@ -117,7 +120,14 @@ def height(x: wp.vec3d, origin: wp.vec3d, normal: wp.vec3d, shared: bool) -> wp.
 def find_crossings(
     mesh: wp.uint64, points: Points, corners: Corners, crosses: wp.array(dtype=wp.uint8)
 ):
-    """Mark the triangles that cross another one."""
+    """Mark the triangles that cross another one.
+
+    With the unit normals n and m of two triangles, their planes meet along the direction n x m.
+    Each triangle cuts an interval off that line; they cross where the common part is longer than
+    SHORT, and where the winding number at one of the four points middle +- ASIDE n +- ASIDE m is
+    neither 0 nor 1. Lengths are in half diagonals of the mesh. The winding numbers come
+    last, for few pairs.
+    """
     t = wp.tid()
     a, b, c = triangle(points, corners, t)
     n = wp.normalize(wp.cross(b - a, c - a))

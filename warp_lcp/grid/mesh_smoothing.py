@@ -76,6 +76,12 @@ def move_kernel(
     """Move a point a share of the way to the mean of its neighbors.
 
     It stays within the domain and within a distance `most` of its start.
+
+    In m, with the mean of its neighbors, sums[p, :3] / sums[p, 3]:
+
+        x <- x + share (mean - x),   then   |x - start| <= most,   then   0 <= x <= size.
+
+    A negative share is the step back of Taubin's smoothing.
     """
     p = wp.tid()
     if held[p] != wp.uint8(0):

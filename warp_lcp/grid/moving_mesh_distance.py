@@ -70,6 +70,11 @@ def enter_mesh(
 
     The distance at the middle of the node's group bounds it and may decide its sign, as in
     `claim_groups`.
+
+    In cells, with the distance d_m at the middle x_m of the group: |d| >= |d_m| - |x - x_m|. If
+    this bound is FAR or more, it is entered with the sign of d_m. Else the distance from the
+    surface is measured; its sign is that of d_m where the bound exceeds ROUNDING, and is measured
+    too elsewhere.
     """
     block = blocks[0]
     node = wp.vec3i(i, j, k)

@@ -161,6 +161,10 @@ def claim_groups(
 
     Nodes that may be nearer than FAR are listed. A node that is nearer to the middle than the
     surface is lies on the same side: its sign is sure.
+
+    In cells, with the distance d_m at the middle x_m of a group: |d| >= |d_m| - |x - x_m|. A bound
+    of FAR or more is entered with the sign of d_m. The sign of a node is sure where the bound
+    exceeds ROUNDING.
     """
     c = wp.tid()
     low = first_node(block, c)

@@ -71,7 +71,10 @@ class ParticleTotals:
         return self.bad_positions == 0 and self.bad_velocities == 0
 
     def joined(self, other: "ParticleTotals") -> "ParticleTotals":
-        """Return sums over these particles and others."""
+        """Return sums over these particles and others.
+
+        Means are weighted by the counts n: mean = (n_1 mean_1 + n_2 mean_2) / (n_1 + n_2).
+        """
         count = self.count + other.count
         if 0 in (self.count, other.count):
             return self if other.count == 0 else other
@@ -465,7 +468,10 @@ class Particles:
         memory.set_list(count, {"key": self.key})
 
     def _grow(self, before: int) -> None:
-        """Enlarge the storage to at least `count` particles; keep the first `before`."""
+        """Enlarge the storage to at least `count` particles; keep the first `before`.
+
+        The new capacity is the largest of room * count, GROWTH * capacity and 1.
+        """
         device = self.grid.device
         self._capacity = max(int(self.exchange.room * self.count), int(GROWTH * self._capacity), 1)
         for name in self._names:
@@ -618,6 +624,8 @@ class Particles:
         else:
             self._totals.run()
             total = self._device_totals.numpy().copy()
+        # Sums [m, m/s] of |v|^2, x (1 to 3) and v (4 to 6), counts of what is not finite (7, 8), and
+        # maxima of |v|^2 (9), x (10 to 12) and -x (13 to 15). Means are sums / count.
         self._last = totals = ParticleTotals(
             count=self.count,
             mean_square_speed=float(total[0]) / self.count,

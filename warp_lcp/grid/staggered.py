@@ -705,6 +705,11 @@ class StaggeredGrid:
 
         Cells (x, y, z), both included, are moved by `shift` along each axis. If the box lies
         outside of the stored cells, the nearest layer of these is returned.
+
+        Along an axis of n cells, with indices of the padded arrays:
+
+            first = clip(low + shift - grow, 0, n + 1),
+            end = max(min(high + shift + grow + 1, n + 2), first + 1).
         """
         first, last = [], []
         for axis in (2, 1, 0):

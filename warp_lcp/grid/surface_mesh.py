@@ -278,6 +278,8 @@ class SurfaceMesh:
         """Move the points on solids onto the solids' shapes.
 
         Points on a side of the domain move along that side.
+
+        Points are in m, `points` in cells and `place` in lattice cells.
         """
         spacing, lattice = self.grid.spacing, self.lattice
         points = mesh.points.numpy() / spacing

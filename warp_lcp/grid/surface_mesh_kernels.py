@@ -60,6 +60,8 @@ def whole_cell_room_kernel(k, j, i, planes: int, parts: int, base: I8, out: F32)
     """Write the distance to whole solid cells: half a lattice cell beside their faces.
 
     Elsewhere it is a large number.
+
+    In lattice cells: -1/2 in a solid cell, 1/2 in an open one beside it, else FAR.
     """
     d = float(FAR)
     if is_solid(base, planes, parts, k, j, i):

@@ -123,6 +123,10 @@ def hit_capsule(a: wp.vec3d, d: wp.vec3d, axis: wp.vec3d, radius: wp.float64):
     """Intersect a path with a capsule from the origin along an axis.
 
     Returns the place on the path, and the normal there.
+
+    The path is x = a + t d, in m, 0 <= t; the place is the least t at which it meets the ball about
+    either end or the cylinder between them. The normal is x - clip(x . axis / |axis|^2, 0, 1) axis,
+    normalized.
     """
     t = hit_ball(a, d, radius)
     t = wp.min(t, hit_ball(a - axis, d, radius))
@@ -331,6 +335,12 @@ def clear_of(
     """Move a point off the shapes that are nearer than `margin`.
 
     With `inside`, only off those that it lies in. Returns the point, and whether it has moved.
+
+    In m, for one shape after another, with its distance d and the direction n away from it:
+
+        x <- x + (1.001 margin - d) n   where d < 0.999 margin, or d < 0 with `inside`.
+
+    In 2-D n is taken within the plane.
     """
     x = p
     moved = bool(False)
@@ -467,6 +477,11 @@ def stop_kernel(
     A particle may slide out of the box between a solid and a side of the box. The point of the box
     that is nearest may lie in the solid, so the path to that point is traced again. If this happens
     twice, the particle stops where it first meets a solid.
+
+    Positions are in m. In the frame of a group the path leads from R0'(x - s0) to R1'(y - s1), with
+    its rotations R and shifts s before and after the step; its end p becomes y = R1 p + s1. Groups
+    are traced in turn until each leaves the end as it is, ROUNDS times each at most, because a changed end is a
+    new path for the other groups.
     """
     x = wp.vec3d(start[i])
     y = wp.vec3d(position[i])

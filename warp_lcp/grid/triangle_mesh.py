@@ -400,6 +400,9 @@ def weld(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.nd
 
     Unused vertices are removed.
 
+    Two vertices are linked if |x_i - x_j| <= WELD times the diagonal, in the mesh's units. Each
+    connected component becomes its first vertex.
+
     Raises:
         ValueError: nearly all are that close together.
     """
