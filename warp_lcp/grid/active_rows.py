@@ -75,6 +75,10 @@ class ActiveRows:
     def window(self, box: Window, particles: Particles, grow: int, step: int) -> Window:
         """Return the window of cells that a step must visit.
 
+        With n segments that this step or the previous one reaches, and N cells of the box, only
+        these segments are visited if N >= LEAST_CELLS and SEGMENT n <= MOST N. Otherwise it is the
+        whole box; if n was too large, no further test takes place for REST steps.
+
         Args:
             box: cells around everything that particles reach.
             particles: the particles.

@@ -125,8 +125,8 @@ def find_crossings(
     With the unit normals n and m of two triangles, their planes meet along the direction n x m.
     Each triangle cuts an interval off that line; they cross where the common part is longer than
     SHORT, and where the winding number at one of the four points middle +- ASIDE n +- ASIDE m is
-    neither 0 nor 1. Lengths are in half diagonals of the mesh. The winding numbers come
-    last, for few pairs.
+    neither 0 nor 1. Lengths are in half diagonals of the mesh. The winding numbers come last,
+    for few pairs.
     """
     t = wp.tid()
     a, b, c = triangle(points, corners, t)

@@ -371,6 +371,9 @@ class Particles:
     def finish_removal(self, marks: wp.array) -> tuple[int, int]:
         """End the removal that has been launched.
 
+        On a GPU, particle p moves to the place (number of particles up to p that stay) - 1, by a
+        prefix sum, which keeps the order.
+
         Args:
             marks: those it was launched with.
 
@@ -624,8 +627,8 @@ class Particles:
         else:
             self._totals.run()
             total = self._device_totals.numpy().copy()
-        # Sums [m, m/s] of |v|^2, x (1 to 3) and v (4 to 6), counts of what is not finite (7, 8), and
-        # maxima of |v|^2 (9), x (10 to 12) and -x (13 to 15). Means are sums / count.
+        # Sums of |v|^2, x [m] (1 to 3) and v [m/s] (4 to 6), counts of x and v that are not finite
+        # (7, 8), maxima of |v|^2 (9), x (10 to 12) and -x (13 to 15). Means are sums / count.
         self._last = totals = ParticleTotals(
             count=self.count,
             mean_square_speed=float(total[0]) / self.count,

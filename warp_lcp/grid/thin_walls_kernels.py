@@ -480,8 +480,8 @@ def stop_kernel(
 
     Positions are in m. In the frame of a group the path leads from R0'(x - s0) to R1'(y - s1), with
     its rotations R and shifts s before and after the step; its end p becomes y = R1 p + s1. Groups
-    are traced in turn until each leaves the end as it is, ROUNDS times each at most, because a changed end is a
-    new path for the other groups.
+    are traced in turn until each leaves the end as it is, ROUNDS times each at most, because a
+    changed end is a new path for the other groups.
     """
     x = wp.vec3d(start[i])
     y = wp.vec3d(position[i])

@@ -95,6 +95,13 @@ class FlexibleGMRES:
 
         `x` is then the change of the solution.
 
+        For vector k, with W = diag(weight) and the image z_k = M W^(-1/2) v_k, Arnoldi's step is
+
+            w = W^(1/2) A z_k,   h_jk = v_j . w for j <= k,   h_(k+1)k = |w - sum_j h_jk v_j|.
+
+        Givens rotations make H triangular; |g_(k+1)| estimates the residual. With H y = g, x is the
+        sum of (y_j - y_j of the last call) z_j. The image z_0 is known at the beginning of a space.
+
         Returns:
             The number of vectors added, and the estimate.
         """

@@ -71,6 +71,9 @@ def coarsest_kernels(variable: bool, d_type: DataType, real: DataType) -> Simple
     """Return the kernels `factor` and `invert`, each in a module of its own.
 
     `factor` computes L D L' by one thread, `invert` works by one block. Each takes long to compile.
+
+    The matrix has a_rr = unit d_r and a_rq = -w for each face of weight w between two unknowns. All
+    arithmetic is in float64.
     """
     name = f"{'variable' if variable else 'uniform'}_{d_type.__name__}_{real.__name__}"
     Stencil = stencil_struct(d_type, real if variable else wp.float32)

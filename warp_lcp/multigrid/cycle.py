@@ -9,10 +9,11 @@ of Algorithm 1 from the levels, in order. They are recorded once, in one `Comman
 bounds the method is monotone multigrid (Kornhuber 1994): no iterate leaves its bounds.
 
 Algorithm 1, one cycle on level l; P maps coarse to fine vectors, alpha is the over-correction.
-    1  smooth          x <- clip(x + omega D^-1 (b - A x)), or sweeps over lines or faces 2
-        restrict        b_c = P'(b - A x),  x_c = 0 3  coarsen bounds  lower_c = max of (lower - x)
-        / alpha over an aggregate; upper_c = min ... 4  recurse         visits of level l + 1:
-        gamma, or 1; on the coarsest level, solve for x 5  correct         x <- x + alpha P x_c
+    1  smooth          x <- clip(x + omega D^-1 (b - A x)), or sweeps over lines or faces
+    2  restrict        b_c = P'(b - A x),  x_c = 0
+    3  coarsen bounds  lower_c = max of (lower - x) / alpha over an aggregate; upper_c = min ...
+    4  recurse         visits of level l + 1: gamma, or 1; on the coarsest level, solve for x
+    5  correct         x <- x + alpha P x_c
     6  smooth          as step 1, in reverse order: the cycle is symmetric
 """
 
@@ -93,7 +94,11 @@ class Cycle:
     def stages(
         self, depth: int = 0, *, visits: int = 1, from_zero: bool = True
     ) -> Iterator[CycleStage]:
-        """Yield consecutive cycles on level `depth`; the numbers are steps of Algorithm 1."""
+        """Yield consecutive cycles on level `depth`; the numbers are steps of Algorithm 1.
+
+        Level l + 1 solves A_c x_c = P'(b - A x) roughly, within its bounds if `projected`; then x
+        <- x + alpha P x_c. Only the first of several visits may take x as 0.
+        """
         if depth == len(self.levels) - 1:
             # Step 4 on the coarsest level.
             yield from self.solve(visits, projected=self.projected, from_zero=from_zero)

@@ -85,6 +85,9 @@ def share_changes(level: StencilLevel, launch: Launch) -> None:
     """Fill the diagonal's ghost cells, and mark rows beside changed ones.
 
     The faces of marked rows depend on the changed cells.
+
+    The values of the ghost cells before the exchange are kept: rows where d differs afterwards are
+    marked.
     """
     s, counts = level.stencil, level.stencil.padding.counts
     assert s.ghosts is not None

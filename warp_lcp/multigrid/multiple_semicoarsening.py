@@ -131,6 +131,13 @@ def turns(stencil: PaddedStencil) -> list[Strength]:
     64 faces hardly depends on random coefficients, surfaces and cut cells, which are few in a
     block; where a block's ratios of weights along the axes differ from the median block's by
     `TURN`, the direction turns.
+
+    The mismatch of two rows of weights w and v, over the axes a, is
+
+        max_a log(w_a / v_a) - min_a log(w_a / v_a);
+
+    it counts where it exceeds log TURN. At least the part SHARE of the sampled blocks must differ
+    from the median block, and a group of that size from the mean weights.
     """
     if stencil.weights is None or stencil.pattern is not None:
         return []

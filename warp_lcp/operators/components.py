@@ -266,7 +266,12 @@ class FloatingComponents:
     def _settle_weighted(
         self, v: np.ndarray, x: DeviceArray, lower: DeviceArray, upper: DeviceArray
     ) -> None:
-        """Choose multiples of v instead of constants, otherwise like `settle`."""
+        """Choose multiples of v instead of constants, otherwise like `settle`.
+
+        For each component, x <- clip(x + c v, l, u). The distances to the bounds are
+        min((x - l) / v) and min((u - x) / v), and the mean, which c removes without bounds, is
+        v'x / v'v.
+        """
         inside, moved = self.label >= 0, x.numpy().copy()
         label, weights, held = self.label[inside], v[inside], self._held.numpy() != 0
         low, values, high = lower.numpy()[inside], moved[inside], upper.numpy()[inside]

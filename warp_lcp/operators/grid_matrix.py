@@ -17,6 +17,9 @@ def grid_matrix(A: HasStencil) -> scipy.sparse.csr_array:
 
     From its diagonal and its weights of neighbors.
 
+    a_ii = unit d_i and a_ij = -w_ij for the weight of each FLUID neighbor j; neighbors of other
+    types have no column. Weights of two faces between the same cells add up.
+
     Args:
         A: an operator in one process.
 

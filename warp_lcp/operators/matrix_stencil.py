@@ -57,7 +57,12 @@ def _offsets(rows: CompressedRows) -> np.ndarray:
 
 
 def _boxes(rows: CompressedRows) -> Iterator[tuple[int, int, int]]:
-    """Yield the boxes (nz, ny, nx) that are compatible with the offsets."""
+    """Yield the boxes (nz, ny, nx) that are compatible with the offsets.
+
+    In the natural order, the neighbor at the step (a, b, c), each -1, 0 or 1, has the offset
+    a + b nx + c nx ny. So nx is among the smallest offsets above 1 and nx ny among those above
+    nx + 1, and those differ from nx ny by at most nx + 1.
+    """
     n, found = rows.indptr.size - 1, _offsets(rows)
     far = np.unique(np.abs(found[np.abs(found) > 1]))
     if len(far) == 0 or len(found) > 27:

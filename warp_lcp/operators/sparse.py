@@ -375,6 +375,8 @@ class SparseOperator(HostPickling):
 
         Rows with a zero diagonal are skipped.
 
+        Projected SOR: x_i <- clip(x_i - omega (A x + b)_i / a_ii, l_i, u_i), with the current x.
+
         Args:
             x: field, moved in place.
             b: field like x.

@@ -219,7 +219,12 @@ class NaturalResidual:
         return self._total(beyond) == 0
 
     def _rows_at(self, x: DeviceArray) -> tuple[np.ndarray, ...]:
-        """Return y, r, d, b and x of the unknowns at x, on the host."""
+        """Return y, r, d, b and x of the unknowns at x, on the host.
+
+        y = A x + b, d = |a_ii|, 1 where that is 0, and the natural residual
+
+            r = max(min(y, d (x - l)), d (x - u)).
+        """
         p, field = self.problem, self.problem.layout.zeros(wp.float64)
         p.bounds.follow(x)
         p.apply_plus(x, p.b, field)

@@ -600,6 +600,8 @@ class FallbackWorkspace(WorkspaceDefaults):
         """Take steps until the residual has fallen to a tenth.
 
         The step fails with STAGNATED if the residual does not fall for GRACE steps.
+
+        The target is max(tolerance, BATCH norm) with the norm of the residual before.
         """
         residual, linear, idle, sank = work.residual, 0, 0, False
         least, target = residual.norm, max(self._progress.tolerance, BATCH * residual.norm)

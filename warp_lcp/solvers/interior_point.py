@@ -376,6 +376,10 @@ class InteriorPointWorkspace(WorkspaceBase):
         """Take Mehrotra's step of `path_step` in four passes over memory.
 
         The pass that moves x also condenses the system of the next step.
+
+        Solve the predictor's system (tau = 0), choose tau = sigma mu from the longest predictor
+        step, solve again with the corrector's right-hand side, and move by min(1, backoff a),
+        where a is the longest step that leaves w, v, s and t >= 0.
         """
         s, finest = self.settings, self._hierarchy.finest
         if not self.condensed:

@@ -68,6 +68,11 @@ class LemkeForm:
         """Return the form of a boxed problem.
 
         A sparse problem must have a finite bound in each row.
+
+        With x = x_0 + C z (`base` and `columns`), M = C'A C and q = C'(A x_0 + b). k unknowns with
+        two bounds, which the k rows P of the identity select, add their pairs:
+
+            M <- [[M, P'], [-P, 0]],   q <- [q; u - l].
         """
         if scipy.sparse.issparse(data.A):
             return cls._of_narrow(data)

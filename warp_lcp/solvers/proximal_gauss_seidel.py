@@ -173,7 +173,12 @@ class ContactWorkspace:
         self._compute_residual(self._program.launch)
 
     def _contacts(self) -> ContactFields:
-        """Return the contacts in the layout of the kernels, color by color."""
+        """Return the contacts in the layout of the kernels, color by color.
+
+        The r-factors are rho_n = 1 / B_nn and rho_t = 1 / (largest eigenvalue of B_tt), with
+        B_tt = J_t J_t' + diag(e_t) over both bodies; the scale of a contact's residual is the mean
+        diagonal of B.
+        """
         p, order = self.problem, self.order
         k, dim, _ = p.one.shape
         J, diagonal = np.concatenate([p.one[order], p.other[order]], axis=2), p.diagonal[order]

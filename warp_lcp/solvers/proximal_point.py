@@ -172,6 +172,10 @@ class ProximalWorkspace(WorkspaceBase):
         """Prepare for the next center; return the status if the solve ends.
 
         It ends if IDLE centers have made no progress, or eps cannot be raised further.
+
+        The center is clip(x, l, u). If the regularized problem is not solved and the residual
+        exceeds FALL times the smallest so far, x returns to the last center and eps, with its least
+        value, becomes min(LARGEST, RAISED eps). Otherwise eps <- max(least, FACTOR eps).
         """
         self._steps = 0
         x.assign(np.clip(x.numpy(), self._lower, self._upper))

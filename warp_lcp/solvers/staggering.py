@@ -176,7 +176,8 @@ class StaggeredRound:
 
         `target` is the residual required of all blocks together.
 
-        `target` is the residual asked for of all blocks.
+        Block k is solved to max(eta |r_k|, SHARE target / sqrt(count)): residuals of this size
+        in all blocks have together the norm SHARE target.
         """
         count, linear = len(self.blocks), 0
         for k in range(count) if forward else reversed(range(count)):

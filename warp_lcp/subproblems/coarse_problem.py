@@ -172,7 +172,12 @@ class CoarseStencilProblem(FullApproximationCorrection):
         return values.ravel()
 
     def _refresh(self) -> bool:
-        """Create the coarse problem if A has changed; return whether there is one."""
+        """Create the coarse problem if A has changed; return whether there is one.
+
+        Its matrix has the diagonal and the 8 weights of the hierarchy's level 1. A coarse cell is
+        an unknown if its diagonal is not 0 and the fine cell at its point is FLUID; all others are
+        AIR.
+        """
         if self._version == self._A.version or len(self._hierarchy.levels) < 2:
             return self._work is not None
         self._version, hierarchy = self._A.version, self._hierarchy

@@ -150,6 +150,13 @@ def begin_kernel(
     Steps follow if the guess misses the tolerance and its residual is comparable to b. Row 0 has
     the reference. The tolerance is absolute, or that of the root mean square if unknowns are
     counted. `calm`: whether the host need not prepare the steps.
+
+    With the norm |r| of the guess's residual, that of the reference |r_0| (row 0), |b| and n
+    counted unknowns:
+
+        tolerance = max(atol, rtol |r_0|), with atol sqrt(n) for atol if unknowns are counted,
+        energy = scalars[ENERGY] / 2,
+        go if |r| > SAFELY tolerance and LEAST_RATIO < |r| / |b| < MOST_RATIO.
     """
     keep_row(scalars, rows, 1)
     norm = wp.sqrt(scalars[NORM])

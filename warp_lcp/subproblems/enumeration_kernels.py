@@ -27,6 +27,9 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
     problem: it returns x, its measure and its set. It works in units in which A is equilibrated, S
     A S with S powers of 2, so that the test for a zero pivot does not depend on the units of the
     rows. `each` expects an equilibrated problem.
+
+    With y = A x + b, each of the 3^n sets states x_i = l_i, y_i = 0 or x_i = u_i for every unknown;
+    a set whose x has the natural residual 0, up to rounding, solves the problem.
     """
     module = wp.get_module(f"warp_lcp.direct_enumeration_{n}_{dtype.__name__}")
     real, count, sets = dtype, n, 3**n
@@ -134,6 +137,10 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
         """Return S, powers of 2, that scales A symmetrically.
 
         S A S has a largest entry near 1 in each row and column together.
+
+        At most EQUILIBRATIONS sweeps change all S_i together:
+
+            S_i <- S_i 2^round(-log2(max_j S_i max(|a_ij|, |a_ji|) S_j) / 2).
         """
         S = vec()
         for i in range(count):
@@ -164,6 +171,9 @@ def enumeration_kernels(n: int, dtype: type) -> SimpleNamespace:
         """Return the first x that solves to rounding, or the best one.
 
         Returns its measure (1 at most) and its set, too; the set is -1 if none has an x.
+
+        The problem is solved as M = S A S, q = S b with the bounds l / S and u / S, and x = S x'.
+        The search ends at the first set whose measure is at most EXACT units of rounding.
         """
         S, M, q, l, u = equilibration(A), mat(), vec(), vec(), vec()
         for i in range(count):

@@ -174,7 +174,11 @@ class EquilibratedWorkspace(WorkspaceBase):
         return SolveStatus.INFEASIBLE if proved_infeasible(self.problem) else SolveStatus.STAGNATED
 
     def _scaled(self) -> Matrix:
-        """Compute R and C, and return R A C on the host."""
+        """Compute R and C, and return R A C on the host.
+
+        R = C = 1 / sqrt(d), rounded to powers of 2, if A is symmetric and has a scale d, else those
+        of `unit_rows_and_columns`. R = C = 1 if max / min of each is at most ALIKE.
+        """
         A = self.problem.A
         assert has(A, HasRows), "`suits` has been asked"
         matrix = A.rows().matrix()

@@ -296,6 +296,9 @@ class HostSystem:
         """Find which unknowns are held at l and which at u.
 
         Nested iteration replaces the step where it is due.
+
+        With the natural residual's d, x_i is held at l_i if x_i - y_i / d_i < l_i, and at u_i if
+        x_i - y_i / d_i > u_i.
         """
         residual = self.iterate.residual
         self._wait -= 1

@@ -355,6 +355,10 @@ class WoodburyCorrection:
         """Assign slots to these columns.
 
         Columns that have a slot keep their potentials; the others' must be computed.
+
+        Slot s holds the n values Z[s n : (s + 1) n] of a potential. They are copied by way of
+        `_spare`, because slots before and after overlap. A column with `_seen` = 0 has no potential
+        yet.
         """
         old, low, n = {q: slot for slot, q in enumerate(self._slot_columns)}, self._low, self._size
         with_potentials = [q for q in strong if q in old and self._seen[q] > 0.0]

@@ -545,7 +545,12 @@ class HostMap:
         return np.asarray(np.diag(p * self.d) + q[:, None] * self.data.A)
 
     def _rows(self, x: np.ndarray, y: np.ndarray, smoothing: float) -> list[np.ndarray]:
-        """Return f, p, q and kinks, in memory that the next call overwrites."""
+        """Return f, p, q and kinks, in memory that the next call overwrites.
+
+        f(x, y) is the map with y = A x + b, and diag(p d) + diag(q) A its generalized Jacobian.
+        With mu = `smoothing` > 0, psi(a, b) = a + b - sqrt(a^2 + b^2 + 2 mu), without penalty
+        (`share` is 1). Points within KINK scale of a kink count as on it.
+        """
         n, data = len(x), self.data
         reals = (x, y, self.d, data.lower, data.upper, *self._element)
         return HOST.run(

@@ -204,7 +204,11 @@ class IncompleteFactors:
         self._free = np.zeros(0, dtype=np.intp)
 
     def restrict(self, free: DeviceArray, shift: DeviceArray | None = None) -> None:
-        """Factor the free block, its diagonal nudged where a factor might be singular."""
+        """Factor the free block, its diagonal nudged where a factor might be singular.
+
+        With the diagonal 0-1 matrix F of the free set, M = F (A + diag(shift)) F. The weight is 1 /
+        |m_ii| on free unknowns, 1 where m_ii = 0, and 0 on the others.
+        """
         self._free = np.flatnonzero(free.numpy())
         matrix = self._A.matrix()
         if shift is not None:
@@ -256,6 +260,9 @@ def perturb_diagonal(
     SuperLU, given those, writes to stderr, and may crash the process. A strictly diagonally
     dominant block is regular and stays unchanged. The diagonal of others grows by a share of each
     row's largest entry, a different one in each row, so that no two rows become equal.
+
+    a_ii <- a_ii + sign(a_ii) share_i max_j |a_ij| with share_i = share (1 + (i GOLDEN mod 1)), for
+    rows i = 0, 1, ...; the sign of 0 is 1.
 
     Args:
         block: square, in compressed columns.

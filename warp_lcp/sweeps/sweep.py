@@ -303,6 +303,9 @@ class Contraction:
         """Compare x with the x of the last call.
 
         Returns DIVERGED, NON_DESCENT where nothing has changed, or None.
+
+        With delta = max |x_i - x_i,old|, `factor` is delta / (the last delta). DIVERGED: delta has
+        grown in RISES calls one after another, and is more than GROWTH times the least one.
         """
         self._out.zero_()
         CHANGE.bind(rows_of(x), x=x, old=self._old, out_of=self._out).launch()

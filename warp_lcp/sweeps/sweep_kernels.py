@@ -78,6 +78,10 @@ def row_kernels(a_type: DataType) -> SimpleNamespace:
     """Return the kernels of row sweeps for entries of type a_type.
 
     `sweep` uses a given order, `greedy` the largest residual.
+
+    Both relax a row by x_i <- clip(x_i - omega y_i / a_ii, l_i, u_i) with y = A x + b, if a_ii > 0;
+    see `scalar_solution` for other signs. `sweep` computes y_i from the entries of the row,
+    `greedy` updates all of y.
     """
     name = f"warp_lcp.sweep.{a_type.__name__}"
     entries, Rows = wp.array(dtype=a_type), matrix_rows(a_type)
