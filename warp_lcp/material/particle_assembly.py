@@ -222,6 +222,9 @@ def make_thin_walls(
 
     One that moves must be thicker than what it may go in a step.
 
+    A solid is too thin below THIN cells; one that moves below max(THIN, cfl + STRIDE_ROOM) cells.
+    With `crossing` the limit is BARRIER cells, for rigid bodies SHEET cells.
+
     Args:
         scene: the scene.
         grid: its grid.
