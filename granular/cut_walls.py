@@ -103,8 +103,8 @@ class CutWalls:
         The normals of a closed surface, weighted with areas, add up to zero. So the wall in a cell
         has the vector area A_a = open_low,a - open_high,a [faces], which points out of the sand,
         the area |A| and the normal A / |A|. Its solid is that with the largest closed part of a
-        face of the cell. The kernel also gets the open volume V and V - (open_low,a + open_high,a)
-        / 2 of each axis.
+        face of the cell. The kernel also gets the open volume V and
+        V - (open_low,a + open_high,a) / 2 of each axis.
         """
         walls = np.array([a - b for a, b in zip(faces, high, strict=True)])
         size = np.sqrt((walls**2).sum(axis=0))

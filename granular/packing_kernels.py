@@ -168,9 +168,9 @@ def face_kernel(
     mass, with a lower limit.
     """
     # mean = (phi_above + phi_below) / 2, plus half of the lesser phi where only that one is below
-    # SURFACE. mass = max(mean, LEAST_MASS) in units of a full face, but 0 if mean <=
-    # LEAST_FRACTION. inverse = 1 / mass; with cut cells 1 / max(open fraction * mass, LEAST_MASS).
-    # Velocities are in m/s.
+    # SURFACE. mass = max(mean, LEAST_MASS) in units of a full face, but 0 if
+    # mean <= LEAST_FRACTION. inverse = 1 / mass; with cut cells 1 / max(open fraction *
+    # mass, LEAST_MASS). Velocities are in m/s.
     c, b, a = cell_below(axis, k, j, i)
     m = float(0.0)
     light = float(0.0)

@@ -108,12 +108,11 @@ def emptiest(
     return part
 
 
-# The particle in part (p_x, p_y, p_z) of cell (i, j, k), p = 0 or 1, is at x = (i - 1 + 1/4 + p_x /
-# 2 + JITTER (r - 1/2) / 2) dx [m] with r uniform in [0, 1), and likewise y and z: its random
-# distance from the center of its part is at most JITTER dx / 4 along each axis. The donor gives its
-# last particles first, so that the others keep their places; the parts of the cell get one each in
-# turn, from the emptiest on. Random numbers depend on the cell's number in the whole domain and on
-# its count, and so are the same on any number of ranks.
+# The particle in part (p_x, p_y, p_z) of cell (i, j, k), p = 0 or 1, is at
+# x = (i - 1 + 1/4 + p_x / 2 + JITTER (r - 1/2) / 2) dx [m] with r uniform in [0, 1), and likewise y
+# and z. The donor gives its particles from the last one backward, so that none is moved twice. The
+# parts of the cell get one each in turn, from the emptiest on. Random numbers depend on the cell's
+# number in the whole domain and on its count, and so are the same on any number of ranks.
 @wp.func
 def take_from(
     cell: int,

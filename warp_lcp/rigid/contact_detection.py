@@ -493,8 +493,8 @@ class ContactDetection:
         All balls, with one point each, are tested at once.
 
         A body is tested if n.(c - p) - |n|.h <= margin [m], with the plane's point p and normal n,
-        and the center c and the half size h of the box around the body. A ball of radius r has gap
-        = n.(c - p) - r, and its contact point c - (r + gap / 2) n is in the middle of the gap.
+        and the center c and the half size h of the box around the body. A ball of radius r has
+        gap = n.(c - p) - r, and its contact point c - (r + gap / 2) n is in the middle of the gap.
         """
         obstacle, n = self.obstacles[number], len(poses)
         points, normals = (

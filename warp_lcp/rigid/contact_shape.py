@@ -257,8 +257,8 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
     )
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # |p - s - t a| - radius [m], with t = clip((p - s).a / a.a, 0, 1) on the segment s ... s +
-        # a. Points on the segment have no gradient; they get a direction across it.
+        # |p - s - t a| - radius [m], with t = clip((p - s).a / a.a, 0, 1) on the segment
+        # s ... s + a. Points on the segment have no gradient; they get a fixed direction across it.
         share = (
             np.clip((points - start) @ axis / square, 0.0, 1.0) if square else np.zeros(len(points))
         )
@@ -383,9 +383,9 @@ def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
     The corners of its convex hull first, then other corners, and middles of long edges.
 
-    An edge from a to b gets the points a + n / m (b - a), n = 1 ... m - 1, with the same m for all
-    edges. With more than `MOST_POINTS` corners every n-th one is taken, from the hull and from the
-    others.
+    With more than `MOST_POINTS` corners every n-th one is taken, from the hull and from the others.
+    Otherwise an edge from a to b gets the points a + n / m (b - a), n = 1 ... m - 1, with the same
+    m for all edges.
     """
     hull = ConvexHull(vertices).vertices
     rest = np.setdiff1d(np.arange(len(vertices)), hull)

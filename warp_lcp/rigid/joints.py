@@ -138,9 +138,9 @@ class Joint:
 
         Errors of equations, distances to limits, 0 for a motor.
 
-        Point: p_first - p_second [m]. Fixed: e / 2 along the locked axes, with e the vector of R S'
-        - S R' [rad]. Hinge: -(R a) x (S a) along them [rad]. Limits: angle - low and high - angle
-        [rad].
+        Point: p_first - p_second [m]. Fixed: e / 2 along the locked axes, with e the vector of
+        R S' - S R' [rad]. Hinge: -(R a) x (S a) along them [rad]. Limits: angle - low and
+        high - angle [rad].
 
         Args:
             bodies: all bodies in their current state.

@@ -133,8 +133,8 @@ def _round(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a stadium or capsule; a disc or ball if the ends coincide.
 
-    Points are e + radius (cos a axis + sin a n) [m], with e the end where cos a > 0 and the start
-    elsewhere: in 2-D n is across the axis, with `AROUND` angles a; in 3-D there are AROUND / 2
+    Points are e + radius (cos(a) axis + sin(a) n) [m], where e is the end if cos(a) > 0 and else
+    the start. In 2-D n is across the axis, with `AROUND` angles a; in 3-D there are AROUND / 2
     angles a and AROUND directions n each, and the two tips.
     """
     axis = end - start
