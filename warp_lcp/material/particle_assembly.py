@@ -538,7 +538,11 @@ def start_band(
 
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
-    """Return a mask of stored cells near a source or a drain; None without both."""
+    """Return a mask of stored cells near a source or a drain; None without both.
+
+    A cell is near if the signed distance of its center from a source or a drain is less than dx
+    [m].
+    """
     regions: list[Shape] = [*scene.source, *scene.drain]
     if not regions:
         return None
