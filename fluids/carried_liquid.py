@@ -78,7 +78,15 @@ class CarriedLiquid:
         return np.asarray(np.eye(inverse.shape[-1]) + inverse @ self.mass)
 
     def _find(self, velocity: Sequence[wp.array], kind: wp.array) -> None:
-        """Sum up G and g over the faces of this process, and then over all processes."""
+        """Sum up G and g over the faces of this process, and then over all processes.
+
+        The liquid up to the cell centers at distances a below and b above the solid [cells], 0
+        where that cell is not FLUID, has at face f the mass m = rho dx^d (a + b) [kg; kg/m in 2-D]
+        and the momentum m u* = rho dx^d (a u_below + b u_above) along the axis n of the face. With
+        c = (n, r x n), r from the body's center of mass to the face's center [m], G = sum of m c c'
+        and g = sum of m u* c. The velocities are those of the faces beside f, since particles may
+        not reach f itself.
+        """
         grid, part, barriers = self.grid, self.grid.part, self.barriers
         near = barriers.reach.common(grid.domain)
         window = None if near is None else near.common(part.faces(near))

@@ -97,6 +97,10 @@ def enter_kernel(
     motions of the body, (vx, vy, wz) in 2-D or (vx, vy, vz, wx, wy, wz) in 3-D, see
     `fluids.coupling`.
     """
+    # U = sum over the cell's sides of s a (n, r x n), with s = +1 on high and -1 on low sides, a
+    # the share of the face that the body covers, n the axis of the face, and r the arm from the
+    # body's center of mass to the face's center [m]. The first run counts entries, so that rows of
+    # cells know where they write.
     row = k * kind.shape[1] + j
     begin = int(0)
     if values:

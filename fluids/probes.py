@@ -192,7 +192,11 @@ class Probes:
         return tuple(column for probe in self.probes for column in probe.columns(self.dimension))
 
     def row(self, simulation: "LiquidSimulation") -> Row:
-        """Return the values of a step, before anything moves."""
+        """Return the values of a step, before anything moves.
+
+        The kernels measure in units of the grid: p = x rho dx / kick_dt [Pa], and a level is dx
+        times its height in cells [m]. Velocities are in m/s.
+        """
         found, scale = (
             self._measure(simulation),
             simulation.scene.physics.density * simulation.grid.spacing / simulation.kick_dt,

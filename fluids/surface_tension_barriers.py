@@ -73,6 +73,10 @@ def jump_kernel(
     k, j, i, near: U8, apart: U8, planes: int, scale: float, kind: I8, bend: F32, jump: F32
 ):
     """Set the jump again in cells beside the surface, from the cell's own curvature."""
+    # jump = scale * curvature [m/s] if a neighbor that no thin solid separates from this cell has
+    # the other type, FLUID or AIR; else 0. Bit d of `apart` marks a thin solid between a cell and
+    # the one before it along axis d. The curvature is in 1 / cells, and
+    # scale = kick_dt sigma / (rho dx^2) [m/s].
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         own = kind[k, j, i]
         value = float(0.0)

@@ -99,6 +99,10 @@ def walled(part: float):
     return wp.vec2(place, variance)
 
 
+# The equation for d [cells] is G(-d) - part Phi((m cos - d) / sigma) = capacity open_share. G is
+# `filled`, Phi the normal distribution, m and v are the mean distance and the variance of the
+# wall's part (`walled`), and sigma^2 = v cos^2 + sin^2 / 4: the variance of the kernel along the
+# wall is 1/4.
 @wp.func
 def whole_share(open_share: float, capacity: float, cosine: float):
     """Return the filled fraction of a whole kernel, from that of its open part.
@@ -302,6 +306,12 @@ def begin_kernel(
     along the wall. The same holds for air at a wall that the liquid does not wet. Elsewhere this is
     the extension of `continue_kernel`.
     """
+    # Distances in cells. In front of the wall the surface is at d = G^-1(value) from the point,
+    # with G of `filled`; the distance in the wall's cell is d - way lean, and the fraction there is
+    # G(-(d - way lean)). Without a surface at the point, |d| is the least of
+    # sign (G^-1(share) + n cos) + a sin over the cells around it that hold the surface, but at
+    # least 3/2: n and a are the offsets of the point from the cell, away from the wall and along
+    # it, and sign is +1 for a wall that the liquid wets, else -1.
     p = points[i]
     away = away_from(cells[i], share.shape[1], share.shape[2], p)
     a = int(wp.floor(p[0]))

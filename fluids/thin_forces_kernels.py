@@ -51,6 +51,9 @@ def edge_of(S: WallKernelFields, axis: int, side: int, k: int, j: int, i: int):
     return distance, crossed
 
 
+# Corner n is the center of cell (i, j, k) + (bits of n) * sides. distance[n, axis] is the distance
+# from that center to the wall on the cube's edge along an axis [cells]; both corners of an edge
+# have their own.
 @wp.func
 def cube_at(S: WallKernelFields, octant: int, k: int, j: int, i: int):
     """Return the cube between the centers of a cell and its neighbors in an octant.
@@ -115,6 +118,9 @@ def arc_area(count: int, a: float, b: float, alike: bool):
     return area
 
 
+# slope = max(d_next - d_corner, 0) [cells per cell], with the distances d of the wall along `axis`
+# from the corner and from the center next to it along `other`. It exists only if no wall separates
+# these two centers, and if both edges cross a wall.
 @wp.func
 def lean(S: WallKernelFields, cube: DualCell, at: wp.vec3i, corner: int, axis: int, other: int):
     """Return the slope of a wall, from its distance at the next cell center.
@@ -321,6 +327,10 @@ def thin_pressure_kernel(
     hydrostatic gradient, and acts on the wall's vector area in the cubes around the edge: the
     impulse is `scale` x per face.
     """
+    # impulse = scale * sum over the octants beside the edge of (x + s d kick_axis + c . kick) A,
+    # with s = +-1 along the edge, d the distance from the cell's center to the crossing [cells], A
+    # the vector area [faces] and c its centroid from the crossing [cells] (`shared_area`); x and
+    # kick [m/s] per cell. The impulse acts at the crossing.
     row = k * x.shape[1] + j
     begin = int(0)
     if values:

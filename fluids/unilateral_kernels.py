@@ -151,6 +151,9 @@ def prepare_kernel(
 
     The shift is that of the open sides of the domain.
     """
+    # b is y of the cell without pressure [m/s], see `slack`. The first guess is the last pressure
+    # times `ratio`, at least 0. Each open side of the domain beside the cell adds its open fraction
+    # a_f to the diagonal: the pressure beyond is 0, so that y gets a_f (x_i - 0).
     unknown = s.base[k, j, i] != _SOLID and kind[k, j, i] != _SOLID
     value = wp.float64(0.0)
     guess = wp.float64(0.0)
@@ -186,6 +189,7 @@ def push_kernel(
 
     These faces are marked 1 in `known`, others 0, or -1 inside solids of whole cells.
     """
+    # u -= (x_i - x_below) / f_f [m/s]: the pressure changes the momentum f_f u_f of the face.
     c = k - wp.where(axis == 2, 1, 0)
     b = j - wp.where(axis == 1, 1, 0)
     a = i - wp.where(axis == 0, 1, 0)

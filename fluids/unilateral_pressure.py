@@ -125,6 +125,9 @@ class UnilateralPressure(PressureProjection):
         """Set up the problem of all cells that are not SOLID; return if there are any.
 
         Arguments as in the base class.
+
+        The rate of filling is dx / dt, and the speed at which a full cell relaxes to the density at
+        rest is c = min(sqrt(g dx), dx / dt), both in m/s.
         """
         self._begin(kick_dt)
         self._rate.value, self._ratio_cell.value = self.grid.spacing / dt, self._ratio

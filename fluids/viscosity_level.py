@@ -406,7 +406,13 @@ class ViscosityLevel:
 
 
 def join_cores(level: ViscosityLevel) -> None:
-    """Find the cores of rows that are cut into boxes of several ranks."""
+    """Find the cores of rows that are cut into boxes of several ranks.
+
+    The core of a row is its longest run of cells whose equations equal those of the cells beside
+    them. Each rank knows its longest run, and the lengths of the runs at both ends of its part
+    (`head`, `tail`). The parts are visited in order along x: a run that ended the part before goes
+    on by `head` cells, and through a whole part if it fills it.
+    """
     grid, ranks, owned = level.grid, level.grid.part.row_ranks, level.grid.part.owned
     if ranks is None:
         return

@@ -28,6 +28,8 @@ def cells_kernel(
     k, j, i, offsets: INTS, position: POINTS, viscosity: POINTS, planes: int, mean: F32
 ):
     """Average the viscosities of a cell's particles; of those around it if it has none."""
+    # mean = sum of mu_p / n over the n particles of the cell, or, if it has none, of the 3^d cells
+    # around it: the arithmetic mean, see above.
     sum = float(0.0)
     count = int(0)
     row = (k * mean.shape[1] + j) * mean.shape[2]

@@ -111,6 +111,8 @@ def moves(S: WallKernelFields, solid: int):
     return found
 
 
+# The closed part of a face is 1 - its open fraction [faces]. Of equal parts the first counts, in
+# the order low x, high x, low y, ...
 @wp.func
 def standing_of(S: WallKernelFields, k: int, j: int, i: int):
     """Return the standing solid with the largest closed part of a face of a cell.
@@ -135,6 +137,10 @@ def standing_of(S: WallKernelFields, k: int, j: int, i: int):
     return owner
 
 
+# The three shares add up to the closed part: own + covered + moved = 1 - open fraction [faces]. The
+# moving solid takes moved = (1 - open fraction) part. Of the rest on a side of the domain (owner
+# 0), solids have what their distance closes, covered = 1 - open fraction of that distance - moved.
+# If the owner itself is the moving solid, the rest belongs to the standing solid of the cell.
 @wp.func
 def closed_on(S: WallKernelFields, axis: int, k: int, j: int, i: int):
     """Return the owner of a face, and the shares of the solids that close it.

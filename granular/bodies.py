@@ -419,6 +419,10 @@ class SandBodies:
         """Split the lists of cells and edges into runs, one per thread.
 
         Returns the first and last entry of both lists for each run, and the runs of each body.
+
+        A run has at most `GRAIN` entries, all of one body and of one list. Shapes: (runs, 4) with
+        first and last cell, first and last edge; (bodies, 2) with first and last run. A last number
+        is one past the end.
         """
         grain = GRAIN[self.grid.device.is_cuda]
         spans: list[list[int]] = []

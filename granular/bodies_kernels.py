@@ -231,6 +231,11 @@ def layer_kernel(faces: IncidenceFields, mass: Vector, u: Vector, weight: Vector
         )
 
 
+# The scales are 1 / diagonal of the gradient. Pressure: sum over the faces of m' / m, with m' = m
+# in loose cells, 1 in full ones, and linear between:
+# full = clip(1 - drive (dt / dx) / NEARLY, 0, 1), where drive dt / dx is the free fraction of the
+# cell. Friction: `stiff` of `packing_kernels.stiffness_kernel`. Masses are relative to a full face,
+# so that both are without unit.
 @forward_kernel(**options)
 def stiffness_kernel(
     grid: FieldShape,

@@ -140,6 +140,10 @@ def unowned_copies(
     The first array has (shear, 4) combined in one number, the second one the cell. A cell that
     touches a solid only with an edge may have a stress there from before the body came near. No
     yield condition bounds this stress any more.
+
+    Copy q of an edge lies in the cell (q & 1) back along the shear's first axis and (q >> 1) back
+    along its second one. An open cell has a wall face that ends at the edge if exactly one of its
+    two neighbors at the edge is solid.
     """
     strides, solid = _strides(grid), index.ravel() >= 0
     copies, cells = [], []
@@ -193,6 +197,10 @@ def _faces(
     """Return the bodies' faces of an axis beside open cells, and their bodies.
 
     Faces are flat indices.
+
+    A face has the body with the larger wall number of its two cells. It is beside an open cell if
+    one of the 3^d cells around either of its cells is open: also faces that only an edge joins to
+    sand.
     """
     owner = np.full(int(max(index.max(initial=0), numbers.max(initial=0))) + 2, -1)
     owner[numbers + 1] = np.arange(len(numbers))

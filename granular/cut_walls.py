@@ -98,7 +98,14 @@ class CutWalls:
         high: list[np.ndarray],
         volume: np.ndarray,
     ) -> None:
-        """Find the cells with a wall, and the arrays of their kernel."""
+        """Find the cells with a wall, and the arrays of their kernel.
+
+        The normals of a closed surface, weighted with areas, add up to zero. So the wall in a cell
+        has the vector area A_a = open_low,a - open_high,a [faces], which points out of the sand,
+        the area |A| and the normal A / |A|. Its solid is that with the largest closed part of a
+        face of the cell. The kernel also gets the open volume V and
+        V - (open_low,a + open_high,a) / 2 of each axis.
+        """
         walls = np.array([a - b for a, b in zip(faces, high, strict=True)])
         size = np.sqrt((walls**2).sum(axis=0))
         at = np.flatnonzero(open_ & (size > LEAST_WALL))
@@ -220,6 +227,9 @@ def _open_faces(
     """Return the open fractions of faces, as solids leave them.
 
     Faces on the domain's sides are included, although its walls close them.
+
+    A side's layer of lower faces gets the open fraction that `_open_part` finds from the distances
+    at the corners of each face, with 2 SAMPLES points along each of its axes.
     """
     for axis, face in enumerate(faces):
         plane_axes = [other for other in range(grid.dimension) if other != axis]
@@ -242,6 +252,9 @@ def _around(
     """Return the open fractions of the cubes around the edges of a shear.
 
     0 beside cells that solids fill, except on the domain's walls.
+
+    A value is the mean over the four cells around the edge, without those beyond the domain, of the
+    open fraction of their octants at the edge; 1 without such cells.
     """
     dimension = octants.ndim - 3
     total, count, filled = (

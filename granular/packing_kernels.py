@@ -167,6 +167,10 @@ def face_kernel(
     would slide off slopes on which it should rest. Of a face that a solid cuts the open part has
     mass, with a lower limit.
     """
+    # mean = (phi_above + phi_below) / 2, plus half of the lesser phi where only that one is below
+    # SURFACE. mass = max(mean, LEAST_MASS) in units of a full face, but 0 if
+    # mean <= LEAST_FRACTION. inverse = 1 / mass; with cut cells 1 / max(open fraction *
+    # mass, LEAST_MASS). Velocities are in m/s.
     c, b, a = cell_below(axis, k, j, i)
     m = float(0.0)
     light = float(0.0)
@@ -266,6 +270,9 @@ def stiffness_kernel(
     It is the largest diagonal entry in the metric of the cell's yield set; 0 in cells without shear
     stress.
     """
+    # Diagonal entries: 2 (1 / m_low + 1 / m_high) along an axis, times the square of its open part
+    # with cut cells, and 4 share (sum of 1 / m of the four faces) at an edge. Masses are relative
+    # to a full face.
     most = float(0.0)
     if int(flags[k, j, i]) & SHEARS_HERE:
         x = inverse.x[k, j, i] + inverse.x[k, j, i + 1]
@@ -382,6 +389,8 @@ def widen_kernel(k, j, first, end, own: I32, wide: I32):
 
     The width is rounded up to whole SIMD vectors, within the range.
     """
+    # Span [low, high) = [min of the spans - 1, max of the spans + 1) over the rows at most one
+    # away, within [first, end); indices of cells.
     low = int(end)
     high = int(0)
     for c in range(wp.max(k - 1, 0), wp.min(k + 2, own.shape[0])):

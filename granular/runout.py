@@ -44,6 +44,9 @@ def count_kernel(
             wp.atomic_add(counts, axis * DIGITS + digit, 1)
 
 
+# The digit is the least one with (sum of the counts up to it) > rank; the new rank is the rank less
+# the counts of smaller digits. Counts are set to 0 for the next digit. `out` is the number whose
+# bits are those found so far: after the last digit the coordinate [m].
 @forward_kernel(module="granular.runout")
 def select_kernel(
     counts: INTS,

@@ -156,6 +156,8 @@ def keep_step_kernel(
     found[step, c] = sums[c]
 
 
+# total_c = sum over the steps of v_c, with v_c the sum over cells and walls, for c < 6. For columns
+# 6 and 7, squared norms, total_c = (sum of sqrt(v_c))^2.
 @forward_kernel(module="granular.momentum")
 def period_kernel(step_sums: wp.array2d(dtype=wp.float64), total: wp.array(dtype=wp.float64)):
     """Combine the sums of a period over cells, walls and ranks; a thread per column.
@@ -242,6 +244,9 @@ def keep_sums_kernel(sums: f64s, decisions: f64s, place: int):
     decisions[place + 1] = sums[1] + sums[COLUMNS]
 
 
+# The norm of the residual is sqrt((pressure + friction) / cells) [m/s], with sums of squares over
+# cells and walls. No minimum of steps is due below NOTHING * tolerance. Steps run if a minimum is
+# due or norm > tolerance (1 + 1e-9).
 @forward_kernel(module="granular.momentum")
 def begin_steps_kernel(
     sums: f64s,
@@ -305,6 +310,9 @@ def resume_steps_kernel(decisions: f64s, going: i32s):
     going[0] = 1
 
 
+# estimate = sqrt(((R_x / step_x)^2 + (SHARE R_s / step_s)^2) / cells) [m/s], where R_x and R_s are
+# the means over the period of the norms of pressure and friction, and step_x and step_s the lengths
+# of their steps.
 @forward_kernel(module="granular.momentum")
 def decide_kernel(
     counted: f64s,

@@ -271,6 +271,13 @@ class MomentumWorkspace(StressWorkspace):
         """Return two decisions: evaluate the residual, and progress has ended.
 
         Also limits the momentum.
+
+        An estimate [m/s] below BETTER times the best one is progress. Progress has ended if there
+        was none for `patience` steps and the estimate is within NEAR_BEST times the best one.
+        Without progress or a change for `wait` steps, the next limit of the momentum holds, if the
+        estimate is above the aim. The residual is due if progress has ended, or if the estimate is
+        at most the aim; before the minimum of steps it must also be at most `_still`, which is 0
+        but at a cold start. The aim is then multiplied by TIGHTER.
         """
         method, stagnates = self.method, False
         self._done += steps_taken

@@ -243,7 +243,13 @@ class InverseKinematics(Settings):
     def _model(
         self, figure: ArticulatedFigure, theta: Vector, error: Vector, radius: float
     ) -> StepProblem:
-        """Return the problem of a step from theta, where g - f is `error`."""
+        """Return the problem of a step from theta, where g - f is `error`.
+
+        H = J'J + (damping reach^2) 1 and c = -J'(g - f) [m^2]. With `curvature`,
+        sum_k (g - f)_k d^2 f_k / dtheta^2 is subtracted, which gives the Hessian of |g - f|^2 / 2;
+        the diagonal then grows until the least eigenvalue is at least DEFINITE reach^2. The bounds
+        of a step are the joint limits less theta, and +-radius [rad].
+        """
         J, scale = figure.jacobian(theta), figure.reach**2
         H, shift = J.T @ J, self.damping * scale
         if self.curvature:

@@ -222,6 +222,11 @@ class KinematicSimulation:
 
         Poses follow from the root of each tree to its ends. Velocities are differences of poses
         over dt.
+
+        With parent p of a body: R = R_p exp([theta a]x), anchor = anchor_p + R_p offset and x =
+        anchor + R (center - joint anchor) [m]. Then v = (x - x_before) / dt [m/s], w = log(R
+        R_before') / dt [rad/s], and the momenta are m v and I w. The inertia I is that of the new
+        rotation, so that the poses come first.
         """
         turns: list[np.ndarray] = []
         anchors: list[np.ndarray] = []
@@ -247,7 +252,11 @@ class KinematicSimulation:
             )
 
     def _mark(self, number: int) -> BodySurface:
-        """Return the marker of a target."""
+        """Return the marker of a target.
+
+        It is an octahedron, in 2-D a square, whose corners lie MARK * reach [m] from the target
+        along the axes.
+        """
         size, dimension = MARK * self.figure.reach, self.bodies.dimension
         ends = np.concatenate([np.eye(3), -np.eye(3)])[:, :] * size
         if dimension == 2:

@@ -130,7 +130,11 @@ class ContactSimulation:
         ]
 
     def _row(self, dt: float, status: str) -> dict[str, float | int | str | None]:
-        """Return a row of the log."""
+        """Return a row of the log.
+
+        Energies are in J, in 2-D in J/m. The potential energy is that at x - dt v / 2: it is -m x.g
+        at the current positions, plus dt m v.g / 2.
+        """
         bodies, solved = self.bodies, self.bodies.contacts > 0 or bool(self.bodies.joints)
         momentum = bodies.bodies.momentum.sum(axis=0)
         # Potential energy half a step earlier.

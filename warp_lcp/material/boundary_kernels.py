@@ -37,6 +37,8 @@ def touch_of(separates: wp.uint8):
 @cell_kernel("warp_lcp.material.boundary")
 def touch_kernel(k, j, i, index: I32, separating: wp.array(dtype=wp.uint8), planes: int, touch: U8):
     """Find the walls on the faces of each cell."""
+    # touch = bitwise or of `touch_of` over the walls in the 2 d neighbors; `index` is -1 in open
+    # cells.
     flags = int(0)
     for n in range(2 * planes + 2):
         side = 2 * (n & 1) - 1
@@ -56,6 +58,7 @@ def touch_cut_kernel(
     k, j, i, planes: int, wx: I16, wy: I16, wz: I16, separating: wp.array(dtype=wp.uint8), touch: U8
 ):
     """Find the walls on the faces of each cell; -1 marks an open face."""
+    # touch = bitwise or of `touch_of` over the walls that close a part of one of the 2 d faces.
     flags = int(0)
     for side in range(2):
         x = int(wx[k, j, i + side])

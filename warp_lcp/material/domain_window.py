@@ -134,6 +134,10 @@ class DomainWindow:
     def _laid(
         self, first: np.ndarray, final: np.ndarray, pace: Sequence[np.ndarray]
     ) -> StaggeredGrid:
+        # Returns a new grid around the cells first ... final. On each side it has AHEAD * pace more
+        # cells, the way of the material in AHEAD steps, at most max(SPARE, an eighth of the
+        # required cells); the ends are then rounded outward to multiples of ALIGNED. If that is a
+        # large part of the domain, the whole domain is returned.
         counts, most = np.array(self.domain.counts), np.maximum(SPARE, (final - first + 1) // 8)
         before, behind = (
             np.minimum(np.ceil(AHEAD * np.asarray(side)), most).astype(int) for side in pace

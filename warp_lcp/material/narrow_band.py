@@ -354,6 +354,10 @@ class NarrowBand:
         The interior counts as H particles, and is weighted as at rest: the difference of H from
         rest is spread over all the liquid. Otherwise the center would move with every particle that
         the band has more or less than its share.
+
+        With N particles and N_0 = particles per cell * interior cells, the interior has the share s
+        = N_0 / (N + N_0), and each mean is (1 - s) of the particles + s of the interior. Units are
+        those of `ParticleTotals`.
         """
         inside, count = self.interior, totals.count + self.held
         if inside.count == 0 or count <= 0:
@@ -373,7 +377,11 @@ class NarrowBand:
         )
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state of the band; unused values are 0, for better compression."""
+        """Return the state of the band; unused values are 0, for better compression.
+
+        Depths are in cells. They are used in cells with depth > min(width - BEYOND, full - 1), and
+        velocities [m/s] on the faces of these cells.
+        """
         depth = self.depth.numpy()
         deep = depth > min(self.width - BEYOND, self.full - 1.0)
         faces = {}
@@ -549,7 +557,12 @@ class NarrowBand:
         )
 
     def _summed_here(self, window: Window, *, launched: bool) -> ParticleTotals:
-        """Sum up the cells without particles of this process."""
+        """Sum up the cells without particles of this process.
+
+        The columns of a row's sums are those of `kernels.sum_kernel`. Means are sums / cells;
+        positions are (index + origin - 1/2) dx [m], 0 along z in 2-D, and squared speeds are in
+        m^2/s^2.
+        """
         box = window.common(self._own)
         if box is None:
             return ParticleTotals()

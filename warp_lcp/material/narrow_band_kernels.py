@@ -103,6 +103,8 @@ def blend_kernel(
     weight: F32,
 ):
     """Blend the carried velocity into the faces, over one cell from depth `start` on."""
+    # u += s (u_carried - u) [m/s] with s = clip(d - start, 0, 1), where d is the mean depth of the
+    # open cells beside the face [cells]. A face without particles takes u_carried wherever s > 0.
     c = wp.max(k - wp.where(axis == 2, 1, 0), 0)
     b = wp.max(j - wp.where(axis == 1, 1, 0), 0)
     for i in range(wp.max(first, 1), end):

@@ -138,7 +138,11 @@ class PartialSites:
         return bool(self.beside)
 
     def _beside(self) -> list[Geometry]:
-        """Return the regions that share a cell with a thin solid; collective."""
+        """Return the regions that share a cell with a thin solid; collective.
+
+        Both the solid and the region must be less than sqrt(d) dx / 2 from the center of a cell
+        [m], the distance of its corners.
+        """
         grid, barriers = self.grid, self.grid.barriers
         if barriers is None:
             return []
@@ -175,6 +179,9 @@ class PartialSites:
         """Return which sites a surface crosses, and their neighbors.
 
         The surfaces are those of the regions, and of the thin solids in them.
+
+        A surface counts if it is less than (sqrt(d) / 2 + 1) site edges from the center of a site
+        [m]: it crosses the site or a neighbor.
         """
         grid, centers = self.grid, self._centers(sites)
         assert grid.barriers is not None, "regions are beside thin solids"
@@ -387,6 +394,11 @@ class PartialSites:
         """Return the part that each part is added to, often itself, and the parts' normals.
 
         A full site gets the normal of the largest part that is added to it.
+
+        A part with a share below NARROW is added to the part with a larger share in the next site
+        along the largest component of its normal, which points into the material; not to one on the
+        other side of a thin solid. Chains are followed to their end. Parts are added in order of
+        their shares, so that the normal of the largest one remains.
         """
         count = len(parts.site)
         axis = np.abs(parts.normal * PREFERRED).argmax(axis=1)

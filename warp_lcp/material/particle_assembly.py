@@ -222,6 +222,9 @@ def make_thin_walls(
 
     One that moves must be thicker than what it may go in a step.
 
+    A solid is too thin below THIN cells; one that moves below max(THIN, cfl + STRIDE_ROOM) cells.
+    With `crossing` the limit is BARRIER cells, for rigid bodies SHEET cells.
+
     Args:
         scene: the scene.
         grid: its grid.
@@ -535,7 +538,11 @@ def start_band(
 
 
 def _exchange_cells(scene: ParticleScene, grid: StaggeredGrid, folder: Path) -> np.ndarray | None:
-    """Return a mask of stored cells near a source or a drain; None without both."""
+    """Return a mask of stored cells near a source or a drain; None without both.
+
+    A cell is near if the signed distance of its center from a source or a drain is less than dx
+    [m].
+    """
     regions: list[Shape] = [*scene.source, *scene.drain]
     if not regions:
         return None

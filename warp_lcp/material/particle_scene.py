@@ -273,6 +273,10 @@ class ParticleScene(Scene):
         whether they do, and what leaves it, is not known before. With a narrow band it is an
         estimate, since its growth is not known either.
 
+        count = min(sites of all shapes + particles from sources, cells per_axis^d). With a narrow
+        band of volume V it is at most (V / dx^d per_axis^d + particles from sources), times SPREAD
+        if later particles count.
+
         Args:
             later: include what sources add; False for the particles at the start.
         """
@@ -316,7 +320,12 @@ class ParticleScene(Scene):
         return sites
 
     def _source_sites(self, source: Source, *, later: bool) -> int:
-        """Return the most particles of a source, at its start and until the run ends."""
+        """Return the most particles of a source, at its start and until the run ends.
+
+        In T seconds ceil(|v_a| T per_axis / dx) + 1 layers of lattice points enter along each axis
+        a with v_a != 0. A layer has the product of the sites along the other axes, each one more
+        where the lattice moves along it.
+        """
         sites = self._sites(source.bounds(self.dimension), whole_cells=True)
         at_start = int(sites.prod()) if later or source.begin == 0.0 else 0
         seconds = max(min(source.stop or math.inf, self.time.duration) - source.begin, 0.0)

@@ -225,6 +225,9 @@ class ParticleSimulation(ParticleCheckpoints):
         """Change the grid or the boxes of ranks, if needed.
 
         The grid changes if the material leaves it in a step, or if it is much too large.
+
+        The required cells are the box around all particles, grown on each side by reach + 3 cells
+        and the most cells that the material can move in the step.
         """
         if self.grid.part.should_rebalance(self.step_count):
             self.rebalance()

@@ -57,6 +57,9 @@ def find_kernel(
     No wall touches them. The surroundings include the cell itself. The order of the list differs
     from run to run on CUDA; it has no effect.
     """
+    # Nearly full: sum of the particles >= FULL at_rest (sum of the capacities), over the open cells
+    # among the 3^d around the cell. It wants particles if it has less than `least`, or less than
+    # `at_rest` beside a cell with more than `most`.
     has = count[k, j, i]
     if has < s.at_rest and base[k, j, i] == _AIR and (touch[k, j, i] & _TOUCHES) == wp.uint8(0):
         held = int(0)
@@ -105,6 +108,11 @@ def emptiest(
     return part
 
 
+# The particle in part (p_x, p_y, p_z) of cell (i, j, k), p = 0 or 1, is at
+# x = (i - 1 + 1/4 + p_x / 2 + JITTER (r - 1/2) / 2) dx [m] with r uniform in [0, 1), and likewise y
+# and z. The donor gives its particles from the last one backward, so that none is moved twice. The
+# parts of the cell get one each in turn, from the emptiest on. Random numbers depend on the cell's
+# number in the whole domain and on its count, and so are the same on any number of ranks.
 @wp.func
 def take_from(
     cell: int,

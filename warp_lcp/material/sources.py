@@ -234,6 +234,9 @@ class Sources:
         """Return the number of particles in each cell, of all processes.
 
         Particles may have entered cells that another process owns.
+
+        A cell's number in the whole domain is (k n_y + j) n_x + i. Each process collects the counts
+        of all processes by this number, and adds those of its own source cells.
         """
         self._counting.run(particles)
         own_counts, part = np.asarray(self._counts.numpy()), self.grid.part
@@ -306,7 +309,11 @@ class Sources:
         return slot[which], entries[which], filled[which] * starts, points[which]
 
     def _enter(self, number: int) -> None:
-        """Launch the motion of a source's lattice points through its cells."""
+        """Launch the motion of a source's lattice points through its cells.
+
+        The lattice points are dx / per_axis apart [m]. The kernel's seed is
+        (random_seed + number) * 0x9E3779B97F4A7C15 + 1 modulo 2^64, as a signed number.
+        """
         grid, seed = self.grid, (self.random_seed + number) * 0x9E3779B97F4A7C15 + 1
         size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
         numbers = {

@@ -101,6 +101,8 @@ def occupants_kernel(
     i, inverse_dx: float, n: wp.vec3i, origin: wp.vec3i, slots: I32, position: POINTS, counts: INTS
 ):
     """Count the particles in each slot."""
+    # Cell of a particle: floor(x / dx) + 1 - origin along each axis, since layer 0 is the ring
+    # around the grid; 1 along z in 2-D. Slot 0: the cell belongs to no source.
     x = position[i] * inverse_dx
     k = int(1)
     if slots.shape[0] > 3:

@@ -177,7 +177,11 @@ class Spray:
         dx: float,
         which: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return a mask of particles that may come near a solid or closed side in a step."""
+        """Return a mask of particles that may come near a solid or closed side in a step.
+
+        It is near if its distance [m] is less than CLEAR dx + (|v| + 10 dx / s) dt, the way at its
+        speed and a margin. Particles without a finite position or velocity count as near.
+        """
         x, v = (
             array.numpy() if which is None else array.numpy()[which]
             for array in (particles.position, particles.velocity)

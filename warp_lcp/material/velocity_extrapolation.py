@@ -66,6 +66,9 @@ def keep_released_kernel(
     They are still unknown, and become known after the first layer. They move as their own particles
     do, but no faster than the mean of the known faces around them, nor against it.
     """
+    # u = sign(u) min(|u|, |m|) if u m > 0, else 0 [m/s], with m the mean of the known faces among
+    # the six next to this one. Faces that become known here are marked 2, so that they do not count
+    # in m.
     # A face with weight is not on the array's edge, see below.
     if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:
         c = k - wp.where(axis == 2, 1, 0)

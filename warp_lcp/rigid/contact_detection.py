@@ -455,7 +455,12 @@ class ContactDetection:
         half: np.ndarray,
         margins: np.ndarray,
     ) -> DetectedContacts:
-        """Return the contacts of bodies with an obstacle."""
+        """Return the contacts of bodies with an obstacle.
+
+        A body is tested if the boxes around it and the obstacle are at most its margin apart [m]:
+        |c_a - c_b| - h_a - h_b <= margin along each axis, with centers c and half sizes h. A
+        rotated box has h_b = |R| h.
+        """
         shape, n = self.obstacles[number].shape, len(poses)
         if shape is None:
             return self._with_planes(number, obstacle_pose, poses, middle, half, margins)
@@ -486,6 +491,10 @@ class ContactDetection:
         """Return the contacts of bodies with the planes of an obstacle.
 
         All balls, with one point each, are tested at once.
+
+        A body is tested if n.(c - p) - |n|.h <= margin [m], with the plane's point p and normal n,
+        and the center c and the half size h of the box around the body. A ball of radius r has
+        gap = n.(c - p) - r, and its contact point c - (r + gap / 2) n is in the middle of the gap.
         """
         obstacle, n = self.obstacles[number], len(poses)
         points, normals = (

@@ -300,6 +300,10 @@ class StewartTrinkleModel:
         """Return a first guess whose impulses are near r.
 
         Friction is split onto the two nearest vectors; beta is the slip speed at r.
+
+        K unit vectors are 2 pi / K apart. Friction f at an angle a from the vector before it is
+        f sin(2 pi / K - a) / sin(2 pi / K) times that vector, plus f sin(a) / sin(2 pi / K) times
+        the next one. beta = max(0, max over the vectors t of -t.u) [m/s].
         """
         k, dim, spread = system.contacts, system.dim, self.spread(system.dim)
         rows, own = dim * k, r[: dim * k].reshape(k, dim)

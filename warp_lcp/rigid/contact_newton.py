@@ -204,6 +204,13 @@ class ContactNewton:
         """Return the Newton step for given changes of the pairs' products.
 
         It also closes the residuals of the linear equations.
+
+        `targets` are the changes of the products x_n u_n, low below and up above, to first order.
+        With y = B x + b, the linear equations are u_n = y_n, low - up = y_t, below = mu x_n + x_t
+        and above = mu x_n - x_t. Eliminating all steps but that of x gives (J J' + C) dx = right. C
+        has the diagonal SHIFT diag B + the part of B besides J J', plus u_n / x_n in normal rows
+        and low / below + up / above in tangent rows; its entry in the row of a tangent at its
+        normal is mu (low / below - up / above).
         """
         normals, tangents, own, mu = self._normals, self._tangents, self._own, self._friction
         to_normal, to_low, to_up = targets

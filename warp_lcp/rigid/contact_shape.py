@@ -202,6 +202,8 @@ def _box(shape: Box, dimension: int) -> ContactShape:
     flat = half[:dimension]
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # With q = |x| - h, in the axes of the box: |max(q, 0)| outside, else the largest q [m]. The
+        # direction is the gradient: max(q, 0) normalized, or the axis of the largest q.
         local = ((points - center) @ R)[:, :dimension]
         beyond = np.abs(local) - flat
         out, deepest = np.maximum(beyond, 0.0), beyond.argmax(axis=1)
@@ -255,6 +257,8 @@ def _around(start: np.ndarray, end: np.ndarray, along: np.ndarray, radius: float
     )
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # |p - s - t a| - radius [m], with t = clip((p - s).a / a.a, 0, 1) on the segment
+        # s ... s + a. Points on the segment have no gradient; they get a fixed direction across it.
         share = (
             np.clip((points - start) @ axis / square, 0.0, 1.0) if square else np.zeros(len(points))
         )
@@ -298,6 +302,8 @@ def _polygon(shape: TriangleMesh) -> ContactShape:
     normals = np.stack([way[:, 1], -way[:, 0]], axis=1) / np.sqrt(squares)[:, None]
 
     def distance(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # Distance to the nearest segment s ... s + a as for a capsule [m]. Its sign is negative if
+        # the angles under which the segments are seen add up to more than pi in size.
         from_start = points[:, None, :2] - start
         share = np.clip((from_start * way).sum(axis=2) / squares, 0.0, 1.0)
         ways = from_start - share[..., None] * way
@@ -376,6 +382,10 @@ def _spread(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return at most `MOST_POINTS` points of a surface.
 
     The corners of its convex hull first, then other corners, and middles of long edges.
+
+    With more than `MOST_POINTS` corners every n-th one is taken, from the hull and from the others.
+    Otherwise an edge from a to b gets the points a + n / m (b - a), n = 1 ... m - 1, with the same
+    m for all edges.
     """
     hull = ConvexHull(vertices).vertices
     rest = np.setdiff1d(np.arange(len(vertices)), hull)

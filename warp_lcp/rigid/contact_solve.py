@@ -504,6 +504,11 @@ class ContactSolve:
 
         Each body is treated separately. A supported body supports the bodies in contact with it
         along directions in which it cannot move: a stack on the floor is supported up to its top.
+
+        With the inverse mass M^-1 = G G' of a body and the rows J of its supports, the eigenvectors
+        V of G'J'J G with eigenvalues > 0 are the supported directions. The body keeps
+        hold = 1 - G^-T V V' G' of an impulse. Bodies are treated from the walls outward, breadth
+        first, since a body supports others only where its own supports are known.
         """
         pushed = self._pushed
         if pushed is not None and pushed.impulses is impulses and pushed.squares is not None:
@@ -569,6 +574,12 @@ class ContactSolve:
         """Return the contacts with their rows.
 
         Tangents are along the slip, or along gravity if it is given.
+
+        The velocity at a contact is
+        v_first + w_first x r_first - v_second - w_second x r_second - v_wall [m/s], with r from the
+        centers of mass [m]. The least normal velocity closes the gap in the step:
+        target = -max(gap, 0) / dt. A pair has friction sqrt(mu_first mu_second), the larger
+        restitution and the smaller size; beside an obstacle the body's own values count.
         """
         falls, n, dim = (
             0.0 if gravity is None else float(np.linalg.norm(gravity)) * dt,

@@ -84,7 +84,11 @@ class Joint:
         return min(self.first, self.second), max(self.first, self.second)
 
     def row_count(self, dimension: int) -> int:
-        """Return the number of rows."""
+        """Return the number of rows.
+
+        It is the dimension (the common point) + locked rotations (0, 2 or 3 in 3-D; 0 or 1 in 2-D)
+        + finite limits + 1 with a motor.
+        """
         turns = (
             {"ball": 0, "hinge": 2, "fixed": 3}
             if dimension == 3
@@ -133,6 +137,10 @@ class Joint:
         """Return the position errors of the rows (m, rad).
 
         Errors of equations, distances to limits, 0 for a motor.
+
+        Point: p_first - p_second [m]. Fixed: e / 2 along the locked axes, with e the vector of
+        R S' - S R' [rad]. Hinge: -(R a) x (S a) along them [rad]. Limits: angle - low and
+        high - angle [rad].
 
         Args:
             bodies: all bodies in their current state.

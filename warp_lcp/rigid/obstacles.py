@@ -69,6 +69,10 @@ def obstacle(solid: PlacedSolid, dimension: int) -> Obstacle:
     """Return a solid of a scene as an obstacle.
 
     Half spaces and inverted boxes are represented by planes, other shapes by their distance.
+
+    A plane has its point placed in the world [m] and the normal R n, or -R n if it is inverted. The
+    planes of an inverted box pass through its lower corner with normals R e_a, and through its
+    upper one with -R e_a: normals point into the box.
     """
     shape = solid.geometry
     if isinstance(shape, Plane):

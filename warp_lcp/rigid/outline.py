@@ -131,7 +131,12 @@ def _box(box: Box, dimension: int) -> tuple[np.ndarray, np.ndarray]:
 def _round(
     start: np.ndarray, end: np.ndarray, radius: float, dimension: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a stadium or capsule; a disc or ball if the ends coincide."""
+    """Return a stadium or capsule; a disc or ball if the ends coincide.
+
+    Points are e + radius (cos(a) axis + sin(a) n) [m], where e is the end if cos(a) > 0 and else
+    the start. In 2-D n is across the axis, with `AROUND` angles a; in 3-D there are AROUND / 2
+    angles a and AROUND directions n each, and the two tips.
+    """
     axis = end - start
     length = float(np.linalg.norm(axis))
     axis = axis / length if length else np.array([1.0, 0.0, 0.0])

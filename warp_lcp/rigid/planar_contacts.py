@@ -170,7 +170,11 @@ class PlanarContacts:
 
     @staticmethod
     def _placed(obstacle: Obstacle, time: float) -> np.ndarray:
-        """Return the kernel's numbers of an obstacle, without its margin."""
+        """Return the kernel's numbers of an obstacle, without its margin.
+
+        Planes have their points and normals in the world; a shape has its own numbers, the pose,
+        and the center and the half size |R| h of the box around it [m].
+        """
         pose, shape = obstacle.pose(time), obstacle.shape
         if shape is None:
             return np.concatenate(
