@@ -195,8 +195,8 @@ def open_area(
     """
     area = float(0.0)
     walls = int(0)
-    corners = int(4)  # a variable, so that the loop is not unrolled
-    for n in range(corners):
+    four = int(4)  # a variable, so that the loop is not unrolled
+    for n in range(four):
         here = first ^ wp.where(n == 1 or n == 2, 1 << along, 0) ^ wp.where(n > 1, 1 << other, 0)
         back = wp.where(n & 1 != 0, along, other)  # axis of the edge to the corner before
         if cube.distance[here, back] != _OPEN:
