@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from default_run import covering
-from drawn_thin_walls import filled, walls_around
+from drawn_thin_walls import drawn, filled, run, walls_around
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
 
@@ -63,6 +63,13 @@ def test_a_tilted_bottle_carries_its_content(angle: float, offset: float) -> Non
     assert -force_y == pytest.approx(weight, rel=0.015)
     assert abs(force_x) < 0.01 * weight
     assert abs(torque) < 0.15 * CELL * weight
+
+
+def test_a_tilted_bottle_in_3d_carries_its_content() -> None:
+    """Walls of 0.75 cells at 15 degrees, at rest: the forces' sum is the weight."""
+    outcome = run(drawn(999106, "bottle", "fluids", 3))
+    assert outcome.load == pytest.approx(1.0, abs=0.02)
+    assert not outcome.passed
 
 
 @pytest.mark.default_cases(2)

@@ -437,11 +437,19 @@ class PartialSites:
         return self._admitted(points, centers)
 
     def _admitted(self, points: np.ndarray, spare: np.ndarray) -> np.ndarray:
-        """Return points [m] of regions where a particle may start, or else spare points."""
-        good = self.boundary.admits(points) & (self._regions_of(points, 0.0) >= 0)
+        """Return points [m] of regions where a particle may start, or else spare points.
+
+        A spare point is the center of a block that may be filled by less than half, so that its
+        center lies beyond the wall: then there is no particle.
+        """
+        good = self._may_start(points)
         points = np.where(good[:, None], points, spare)
-        good[~good] = self.boundary.admits(points[~good])
+        good[~good] = self._may_start(points[~good])
         return np.asarray(points[good])
+
+    def _may_start(self, points: np.ndarray) -> np.ndarray:
+        """Return which points [m], shape (n, 3), lie in a region where a particle may start."""
+        return np.asarray(self.boundary.admits(points) & (self._regions_of(points, 0.0) >= 0))
 
     def _lanes(
         self, parts: SiteFractions, target: np.ndarray, normal: np.ndarray, in_lane: np.ndarray
