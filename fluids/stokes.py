@@ -415,6 +415,9 @@ class StokesSolve:
         used = converged or relative <= USEFUL * first
         if not used:
             self._restore(velocity, moved)
+        elif operator.bodies is not None:
+            operator.settle_bodies(velocity, preconditioner.work)
+            moved()
         energy = self._density * self._grid.cell_volume
         return StokesResult(
             share,
@@ -445,7 +448,7 @@ class StokesSolve:
         self.keep_viscous(velocity)
         copy(self._split_pressure, self._projection.pressure)
         if self.operator.bodies is not None:
-            self._split_bodies = self.operator.bodies.velocities
+            self._split_momenta = self.operator.bodies.momenta()
 
     def _restore(self, velocity: Sequence[wp.array], moved: Callable[[], None]) -> None:
         """Restore the split step's result."""
@@ -454,7 +457,7 @@ class StokesSolve:
         copy(self._projection.pressure, self._split_pressure)
         bodies = self.operator.bodies
         if bodies is not None:
-            bodies.move(self._split_bodies - bodies.velocities)
+            bodies.restore_momenta(self._split_momenta)
             moved()
 
     def state(self) -> dict[str, np.ndarray]:

@@ -50,6 +50,7 @@ class StokesBodies:
         density: float,
     ) -> None:
         self.bodies, self._dimension, self._drag = bodies, grid.dimension, drag
+        self._scale = density * grid.cell_volume
         self.free_parts = grid.faces()
         self._flow = BodyCoupling(grid, boundary, bodies, density, open_parts=self.free_parts)
         self._flow.columns.comm = drag.columns.comm
@@ -63,8 +64,18 @@ class StokesBodies:
         return np.ravel([body.velocities(self._dimension) for body in self.bodies.bodies])
 
     def keep_start(self) -> None:
-        """Store V*."""
+        """Store V*, and the momenta."""
         self.start = self.velocities
+        self._start_momenta = self.momenta()
+
+    def momenta(self) -> list[tuple[np.ndarray, ...]]:
+        """Return the momenta and the impulses received, for `restore_momenta`."""
+        return [body.momenta() for body in self.bodies.bodies]
+
+    def restore_momenta(self, momenta: Sequence[tuple[np.ndarray, ...]]) -> None:
+        """Restore momenta and received impulses."""
+        for body, values in zip(self.bodies.bodies, momenta, strict=True):
+            body.restore_momenta(values)
 
     def update(
         self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
@@ -74,10 +85,13 @@ class StokesBodies:
         self._flow.update(walls.kind)
         self._flow.grow_entries()
         self._m, self._D = self._drag.factors()
-        inverses = [body.inverse_mass(self._dimension) for body in self.bodies.bodies]
-        self._masses = scipy.linalg.block_diag(*(np.linalg.pinv(m) for m in inverses))
+        # Masses without supports: m itself is singular along supported directions, and a
+        # pseudo-inverse of it amplifies rounding. For z and r in the range of m, z'm^+ r = z'm0^-1 r
+        # with m0 = rho dx^d times the inverse of these masses.
+        inverses = [body.free_inverse_mass(self._dimension) for body in self.bodies.bodies]
+        self._masses = scipy.linalg.block_diag(*(np.linalg.inv(m) for m in inverses))
         self._response = np.linalg.inv(np.eye(self.rank) + self._m @ self._D)
-        self._energy = np.linalg.pinv(self._m)
+        self._energy = self._masses / self._scale
 
     @property
     def weights(self) -> np.ndarray:
@@ -87,10 +101,14 @@ class StokesBodies:
 
     def pull(self, u: wp.array, x: wp.array | None) -> np.ndarray:
         """Return m (C'u + U'x)."""
+        return np.asarray(self._m @ self._pulled(u, x))
+
+    def _pulled(self, u: wp.array, x: wp.array | None) -> np.ndarray:
+        """Return C'u + U'x."""
         total = self._drag.columns.gather(u).numpy().copy()
         if x is not None:
             total += self._flow.columns.gather(x).numpy()
-        return np.asarray(self._m @ total)
+        return np.asarray(total)
 
     def rows(self, V: np.ndarray, u: wp.array, x: wp.array) -> np.ndarray:
         """Return V - m (C'u - D V + U'x)."""
@@ -115,9 +133,27 @@ class StokesBodies:
         return float(z @ self._energy @ r)
 
     def move(self, change: np.ndarray) -> None:
-        """Change the velocities of the bodies."""
-        count = len(self.bodies.bodies)
-        self.bodies.bodies.apply_impulses((self._masses @ change).reshape(count, -1))
+        """Change the velocities of the bodies, but not along supported directions.
+
+        The impulse is M0 P dV: M0 are the masses without supports, and P = M^-1 M0 projects on the
+        velocities that supports allow.
+        """
+        allowed = self._m @ (self._energy @ change)
+        self._push(self._masses @ allowed)
+
+    def apply_impulses(self, u: wp.array, x: wp.array) -> None:
+        """Apply the impulse of the liquid, rho dx^d (C'u - D V + U'x), since `keep_start`.
+
+        It has the parts, too, that supports absorb: they press the bodies on each other. Velocities
+        change by the residual of the bodies' rows.
+        """
+        impulse = self._pulled(u, x) - self._D @ self.velocities
+        self.restore_momenta(self._start_momenta)
+        self._push(self._scale * impulse)
+
+    def _push(self, impulses: np.ndarray) -> None:
+        """Apply impulses, shape (rank,)."""
+        self.bodies.bodies.apply_impulses(impulses.reshape(len(self.bodies.bodies), -1))
 
     def settle(self) -> None:
         """End the step: the bodies have its velocities."""

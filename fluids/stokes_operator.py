@@ -379,6 +379,18 @@ class StokesOperator:
                 axis=axis,
             )
 
+    def settle_bodies(self, velocity: Sequence[wp.array], work: wp.array) -> None:
+        """Apply the impulses of the liquid to the bodies, after a solve.
+
+        Args:
+            velocity: u.
+            work: a vector (overwritten).
+        """
+        if self.bodies is not None:
+            for part, u in zip(self.layout.components(work), velocity, strict=True):
+                copy(part, u)
+            self.bodies.apply_impulses(work, self.projection.pressure.flatten())
+
     def _launch_residual(self, velocity: Sequence[wp.array], residual: wp.array) -> None:
         """Write the residual from the viscous force and the outflow, without bodies."""
         kernels, level, window = self.kernels, self.level, self.window

@@ -1,0 +1,101 @@
+"""Coupled solve of velocity and pressure with rigid bodies: impulses, supports, drawn scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import small_liquids
+from default_run import chosen
+from small_liquids import GRAVITY, box, create
+from viscous_scenes import coupled_scene
+from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.simulation import StepFailed
+
+ALWAYS = 1e-12  # splitting tolerance at which every step is coupled
+STEP = 0.005  # [s]
+
+
+def on_a_body(dimension: int) -> LiquidSimulation:
+    """Return thick liquid that falls on a body, which stands on the floor between two blocks.
+
+    The liquid touches nothing else. The body cannot move.
+    """
+    low, high = [0.2, 0.0, 0.2][:dimension], [0.8, 0.25, 0.8][:dimension]
+    side = [0.2, 0.25, 1.0][:dimension]
+    blocks = [
+        box([0.0] * dimension, side),
+        box([0.8, 0.0, 0.0][:dimension], [1.0, *side[1:]]),
+    ]
+    liquid = box(
+        [0.4, 0.25, 0.4][:dimension],
+        [0.6, 0.5, 0.6][:dimension],
+        velocity=[0.5, -1.0, 0.25][:dimension],
+    )
+    return create(
+        small_liquids.scene(
+            size=[1.0] * dimension,
+            resolution=16 if dimension == 2 else 12,
+            liquid=[liquid],
+            wall="separating",
+            solid=[{**box(low, high), "density": 5000.0, "wall": "sticky"}, *blocks],
+            pressure={"surface": "voxel"},
+            viscosity={"value": 1e3, "splitting_tolerance": ALWAYS},
+        )
+    )
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_body_receives_the_momentum_that_the_liquid_loses(dimension: int) -> None:
+    # Supports absorb all of it, but contacts between bodies have to know it.
+    simulation = on_a_body(dimension)
+    bodies, stokes = simulation.bodies, simulation.stokes
+    assert bodies is not None and stokes is not None
+    received, lost = [], []
+    solve_contacts = simulation.solve_contacts
+
+    def watched() -> None:
+        operator = stokes.operator
+        mass = 1000.0 * simulation.grid.cell_volume
+        received.append(bodies.bodies.received_impulse[0, :dimension].copy())
+        lost.append(
+            [
+                mass * float((volume.numpy() * (before.numpy() - u.numpy())).sum())
+                for volume, before, u in zip(
+                    operator.level.volume, operator.start, simulation.velocity, strict=True
+                )
+            ]
+        )
+        solve_contacts()
+
+    simulation.solve_contacts = watched  # type: ignore[method-assign]
+    for _ in range(4):
+        row = simulation.step(STEP)
+        assert row["stokes_iterations"] > 0
+    weight = 1000.0 * 0.2 ** (dimension - 1) * 0.25 * GRAVITY * STEP
+    for impulse, momentum in zip(received, lost, strict=True):
+        assert np.abs(impulse - momentum).max() <= 1e-4 * np.abs(momentum).max()
+        assert -impulse[1] > 0.5 * weight
+    assert np.abs(bodies.bodies.velocities()).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", chosen([889003, 889017, *range(889023, 889040)], [889003]))
+def test_drawn_scenes_of_bodies_take_their_steps(seed: int) -> None:
+    # 889003: body 2 touches walls in nearly all directions, and has left the liquid.
+    simulation = create(coupled_scene(seed))
+    for _ in range(18):
+        dt = min(simulation.stable_dt(), 0.02)
+        for _ in range(3):
+            try:
+                row = simulation.step(dt)
+                break
+            except StepFailed:
+                dt *= 0.5
+        else:
+            pytest.fail("no step of a quarter of the stable time step was taken")
+        if row.get("stokes_iterations"):
+            assert row["stokes_error"] <= 3.0 * simulation.stokes.tolerance
+        assert float(np.abs(simulation.particles.velocity.numpy()).max()) < 20.0
+        if simulation.bodies is not None:
+            # Faster than 20 m/s at its rim is no body.
+            assert np.abs(simulation.bodies.bodies.velocities()[:, :3]).max() < 20.0
