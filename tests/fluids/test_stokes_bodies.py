@@ -23,10 +23,7 @@ def on_a_body(dimension: int) -> LiquidSimulation:
     """
     low, high = [0.2, 0.0, 0.2][:dimension], [0.8, 0.25, 0.8][:dimension]
     side = [0.2, 0.25, 1.0][:dimension]
-    blocks = [
-        box([0.0] * dimension, side),
-        box([0.8, 0.0, 0.0][:dimension], [1.0, *side[1:]]),
-    ]
+    blocks = [box([0.0] * dimension, side), box([0.8, 0.0, 0.0][:dimension], [1.0, *side[1:]])]
     liquid = box(
         [0.4, 0.25, 0.4][:dimension],
         [0.6, 0.5, 0.6][:dimension],
