@@ -87,6 +87,8 @@ def offers(simulator: str, dimension: int) -> dict[str, ModelScenes]:
     if simulator == "granular":
         return both
     level_set: Tables = {"pressure": {}}
+    sticky: Tables = {"domain": {"wall": "sticky"}}
+    thick: Tables = {"value": 1e3}
     middle = [0.5, 0.1, 0.25][:dimension]
     probes = [
         {"name": name, "position": middle, "quantity": name}
@@ -97,7 +99,12 @@ def offers(simulator: str, dimension: int) -> dict[str, ModelScenes]:
         "ghost-fluid surface": ModelScenes(level_set),
         "smoothing": ModelScenes({"pressure": {"smoothing": 2}}, level_set),
         "unilateral pressure": ModelScenes({"pressure": {"model": "unilateral"}}, level_set),
-        "viscosity": ModelScenes({"viscosity": {"value": 10.0}}),
+        "viscosity": ModelScenes({"viscosity": {"value": 10.0, "splitting_tolerance": math.inf}}),
+        # Thick enough that every step is solved at once; it then replaces the viscous solve.
+        "coupled solve": ModelScenes(
+            sticky | {"viscosity": thick},
+            sticky | {"viscosity": thick | {"splitting_tolerance": math.inf}},
+        ),
         "surface tension": ModelScenes(
             level_set | {"surface_tension": {"coefficient": 0.072}}, level_set
         ),

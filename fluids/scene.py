@@ -80,11 +80,11 @@ class ViscositySettings(Table):
         description='slip length of "separating" and "sticky" walls [m]',
     )
     splitting_tolerance: float = Field(
-        default=math.inf,
+        default=0.05,
         ge=0,
         allow_inf_nan=True,
         description="error of the split step, relative to the velocity, above which velocity and "
-        "pressure are solved at once; inf: never",
+        "pressure are solved at once; inf: never, 0: always",
     )
 
 

@@ -105,7 +105,10 @@ class LiquidSimulation(ParticleSimulation):
         self.measured: dict[str, Row] = {}
         if self.scene.couples and (self.stokes is None or self.stokes.unsupported):
             where = "on several ranks" if self.stokes is None else "with bodies thinner than a cell"
-            self._notes.append(f"viscosity.splitting_tolerance has no effect {where}")
+            self._notes.append(
+                f"viscosity.splitting_tolerance has no effect {where}: pressure and viscosity act "
+                "one after the other"
+            )
         if self.tension is not None:
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")

@@ -4,6 +4,7 @@
 """
 
 import json
+import math
 import sys
 from pathlib import Path
 from unittest.mock import patch
@@ -350,7 +351,12 @@ BARE_STEPS = 4
 
 
 def scene(**tables) -> ParticleScene:
-    """Return a scene of liquid, or of sand."""
+    """Return a scene of liquid, or of sand.
+
+    Ranks solve for pressure and viscosity one after the other, so the scene on one process does so.
+    """
+    if "viscosity" in tables:
+        tables["viscosity"] = tables["viscosity"] | {"splitting_tolerance": math.inf}
     return small_sands.scene(**tables) if "sand" in tables else small_liquids.scene(**tables)
 
 

@@ -3,6 +3,7 @@
 A cycle and a product of all ranks are compared with those of one process.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from warp_lcp.fluids.simulator import FluidsSimulator, LiquidSimulation
 # or in both.
 SEEDS = (10, 21, 27)
 ROUNDING = 1e-6  # where a cut lies in a row, cells of the row are grouped differently
-STIFF = {"value": 300.0}
+STIFF = {"value": 300.0, "splitting_tolerance": math.inf}
 
 
 def applied(simulation: LiquidSimulation, whole: np.ndarray) -> list[np.ndarray]:
