@@ -28,7 +28,7 @@ VISCOUS_BYTES = {2: 140, 3: 220}
 # Viscosities of cells and edges, and the first particle of each cell, where viscosities differ.
 MIXED_BYTES = {2: 12, 3: 20}
 # Fields of the coupled solve, its Krylov vectors, and the levels of its pressure cycle.
-STOKES_BYTES = {2: 750, 3: 1000}
+STOKES_BYTES = {2: 2500, 3: 1400}
 # Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
 # at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5
