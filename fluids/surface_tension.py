@@ -133,7 +133,7 @@ class SurfaceTension:
         self._calming = LaunchGraph(grid.device, self._launch_velocity_damping, at_once=shared)
         self._measuring = LaunchGraph(
             grid.device,
-            lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares),
+            lambda kind: self._energy.launch(self._cells, self._faces(kind), self._shares),
         )
         self._find_walls()
 

@@ -233,7 +233,7 @@ def _classified(
         residual.diagonal,
     )
     # The result must still belong to the problem; its largest residual entry bounds the error of x.
-    tally.take(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
+    tally.launch(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
     square, largest = tally.read()
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
     if not norm <= allowed and not norm <= allowed + residual.rounding_floor(x, ROUNDING):

@@ -652,7 +652,7 @@ class Particles:
         """Launch the sums over the particles, and over the threads' partial sums."""
         rows = replace(self._rows_of_totals(), memory=self._total_rows)
         if self._tally is not None:
-            self._tally.take(
+            self._tally.launch(
                 rows, self.grid.placement, position=self.position, velocity=self.velocity
             )
             return

@@ -116,7 +116,7 @@ class DensityMonitor:
 
     def _launch(self, density: wp.array) -> None:
         b = self.boundary
-        self._crowd.take(
+        self._crowd.launch(
             self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density
         )
 
@@ -384,13 +384,15 @@ class DensityCorrection:
         """Set up the problem, and count overfull cells."""
         b, most = self.boundary, self.max_density
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
-        self._over.take(
+        self._over.launch(
             self._solved, fields, base=b.base, contact=contact, most=most, gain=self.gain
         )
         if self._inside is not None:
             self.grid.part.fill(self._inside)  # before those deep inside are told by them
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
-            self._lacking.take(self._solved, fields, least=least, planes=planes, lower=self._lower)
+            self._lacking.launch(
+                self._solved, fields, least=least, planes=planes, lower=self._lower
+            )
             if self._counted is not None:
                 launch(
                     add_kernel,
