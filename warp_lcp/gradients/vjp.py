@@ -220,6 +220,10 @@ def _classified(
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray, int, int]:
     """Classify the unknowns of a result as free or held.
 
+    With d the scale of a row, an unknown is held if d (x - l) <= t or d (u - x) <= t, and
+    degenerate if also |y| <= t. t is the largest entry of the residual plus
+    ROUNDING (2 d |x| + |b|).
+
     Returns y, the cell types with 0 where an unknown is held, the bound that holds it, and the
     numbers of free and of degenerate unknowns.
     """

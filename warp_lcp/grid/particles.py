@@ -532,6 +532,10 @@ class Particles:
         self.exchange.end_sort()
 
     def _sort_cells(self) -> None:
+        """Sort all columns by the cells' numbers.
+
+        `offsets[c]` is then the number of particles in cells before c.
+        """
         grid = self.grid
         if self.count == 0:
             if self.offsets is not None:

@@ -343,7 +343,11 @@ class DensityCorrection:
         return Correction(result, over_full, most)
 
     def _launch_displacement(self, x: wp.array) -> None:
-        """Launch the computation of the displacement on all faces."""
+        """Launch the computation of the displacement on all faces.
+
+        d_i = dx (x_(i-1) - x_i) / the mean filled share, in m, with at most LONGEST cells in all
+        directions together.
+        """
         self._store_solution(x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
@@ -381,7 +385,11 @@ class DensityCorrection:
         part.fill(self._kind)
 
     def _prepare(self, contact: wp.array | None) -> None:
-        """Set up the problem, and count overfull cells."""
+        """Set up the problem, and count overfull cells.
+
+        A cell is overfull if its density, relative to rest, is above `max_density`. One deep inside
+        lacks material below `least` = min(max_density, 2 - max_density).
+        """
         b, most = self.boundary, self.max_density
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
         self._over.launch(
