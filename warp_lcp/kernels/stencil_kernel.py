@@ -37,7 +37,6 @@ from warp_lcp.kernels.layout import (
     KernelStencil,
     PrecomputedProduct,
     RowLayout,
-    Rows,
     copy_of,
     native_of,
     offset_of,
@@ -51,6 +50,7 @@ from warp_lcp.kernels.recorded_arguments import (
     Scalar,
     slot_of,
 )
+from warp_lcp.kernels.rows import Rows
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 from warp_lcp.kernels.types import DataType, DeviceArray, FieldType, StructInstance
 
