@@ -415,13 +415,13 @@ def replayed():
 
     Call it once the package can be imported. Loops of graphs read their conditions in place.
     """
-    from warp_lcp.kernels import device_graph, host_kernel, layout
+    from warp_lcp.kernels import device_graph, host_kernel, rows
     from warp_lcp.kernels import joined_graphs as joined
     from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, Loop
 
     if CELLS:
         context.invoke = checked_by_cells(context.invoke)
-        layout.MANY_CELLS_OF_BLOCKS = 1  # all quads are loaded in blocks where rows allow it
+        rows.MANY_CELLS_OF_BLOCKS = 1  # all quads are loaded in blocks where rows allow it
 
     class HostGraph(LaunchGraph):
         """Launch graph in host memory.

@@ -38,6 +38,7 @@ from benchmarks.machine_counts import KINDS, IssuedInstructions, issued
 from benchmarks.machine_memory import EmulatedMemory, constants_of
 from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.kernels import StencilKernel, layout
+from warp_lcp.kernels import rows as kernel_rows
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.multigrid.stencil_level import StencilLevel
 
@@ -189,7 +190,9 @@ def passes() -> dict[str, tuple[BoundByName, Tables]]:
         return bound
 
     blocks = math.prod(SHAPE) // 8  # of the next level, too, but not of those in one launch
-    many = mock.patch.multiple(layout, MANY_CELLS=1, SUMMED_CELLS=1, MANY_CELLS_OF_BLOCKS=blocks)
+    many = mock.patch.multiple(
+        kernel_rows, MANY_CELLS=1, SUMMED_CELLS=1, MANY_CELLS_OF_BLOCKS=blocks
+    )
     with many, mock.patch.object(StencilKernel, "bind_arguments", listening):
         stopping = wl.StoppingCriteria(rtol=0, max_iterations=3)
         lower = np.where(wall, 0.0, -np.inf)

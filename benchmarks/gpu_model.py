@@ -51,7 +51,8 @@ from benchmarks.gpu_launches import LaunchCounter
 from warp_lcp.benchmarks.kernels import BoundByName
 from warp_lcp.benchmarks.problems import splash
 from warp_lcp.grid import staggered
-from warp_lcp.kernels import StencilKernel, layout
+from warp_lcp.kernels import StencilKernel
+from warp_lcp.kernels import rows as kernel_rows
 from warp_lcp.kernels.persistent_kernel import THREADS, PersistentKernel
 from warp_lcp.kernels.stencil_kernel import BoundKernel
 from warp_lcp.kernels.vectors import add_up_kernel
@@ -80,7 +81,10 @@ SIZES = (128, 256, 512, 1024)
 STEP_SIZES = (64, 128, 256)
 COUNTED = 64  # cells along x of the largest steps that are counted
 # Numbers of cells from which threads take several planes of a row, or blocks of it.
-LARGE = {layout: ("MANY_CELLS", "SUMMED_CELLS", "MANY_CELLS_OF_BLOCKS"), staggered: ("MANY_CELLS",)}
+LARGE = {
+    kernel_rows: ("MANY_CELLS", "SUMMED_CELLS", "MANY_CELLS_OF_BLOCKS"),
+    staggered: ("MANY_CELLS",),
+}
 
 
 @dataclass
@@ -543,7 +547,7 @@ def as_large(levels: int) -> AbstractContextManager[object]:
 
     The numbers of cells from which threads take several planes or blocks are divided by 8^levels.
     """
-    layout._flat.cache_clear()
+    kernel_rows._flat.cache_clear()
     stack = ExitStack()
     for module, names in LARGE.items():
         smaller = {name: getattr(module, name) >> 3 * levels for name in names}

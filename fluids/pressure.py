@@ -294,7 +294,7 @@ class PressureProjection:
             Scalar() for _ in range(4)
         )
         self._counting = LaunchGraph(
-            grid.device, lambda: self._count.take(self._cells, kind=self._unknown)
+            grid.device, lambda: self._count.launch(self._cells, kind=self._unknown)
         )
         self._preparation = LaunchGraph(grid.device, self._launch_preparation)
         launches = self._launch_projection, self._copy_cells, self._copy_faces
@@ -569,7 +569,7 @@ class PressureProjection:
                 axis=axis,
             )
         self._support(velocity, window)
-        self._contacts.take(
+        self._contacts.launch(
             self._cells,
             self._faces,
             FaceVelocity.of(velocity),
@@ -633,7 +633,7 @@ class PressureProjection:
         moved()
         projected = self.project(velocity, window, result, criteria)
         self._cells.run(SUM_PRESSURE, x=self.pressure, before=before, kind=self.kind)
-        self._contacts.take(
+        self._contacts.launch(
             self._cells,
             self._faces,
             FaceVelocity.of(velocity),

@@ -27,7 +27,7 @@ from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.stokes_forces import viscous_impulses
 from warp_lcp.fluids.stokes_operator import FIRST, LOOK, StokesOperator
 from warp_lcp.fluids.stokes_preconditioner import StokesPreconditioner
-from warp_lcp.fluids.stokes_vectors import WindowSums
+from warp_lcp.fluids.stokes_vectors import WindowSums, launch_graphs
 from warp_lcp.fluids.viscosity import Viscosity
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
@@ -143,14 +143,11 @@ class StokesSolve:
         )
         # Launches between two decisions of the host.
         self._estimation = LaunchGraph(grid.device, self._launch_estimation)
-        self._corrections = LaunchGraph(
-            grid.device, self._launch_corrections, at_once=grid.device.is_cuda
-        )
-        self._start_from_last = LaunchGraph(
-            grid.device, self._launch_start_from_last, at_once=grid.device.is_cuda
-        )
-        self._estimate_graph = LaunchGraph(
-            grid.device, self._launch_pressure_difference, at_once=grid.device.is_cuda
+        self._graphs = launch_graphs(
+            grid.device,
+            self._launch_corrections,
+            self._launch_start_from_last,
+            self._launch_pressure_difference,
         )
         self._krylov: FlexibleGMRES | None = None  # built, with its vectors, at the first use
         self.continues = False
@@ -300,7 +297,7 @@ class StokesSolve:
         self.allocate()
         self._save(velocity)
         operator.take_equations(kick_dt)
-        self._start_from_last.run(velocity, projection.kind, projection.contact)
+        self._graphs["_launch_start_from_last"].run(velocity, projection.kind, projection.contact)
         if operator.bodies is not None:
             operator.bodies.move(self._last_bodies - operator.bodies.velocities)
             moved()
@@ -336,7 +333,7 @@ class StokesSolve:
     def _splitting_error(self) -> float:
         """Return an estimate of |u - u2|_V, see `couple_from_last`."""
         operator, preconditioner = self.operator, self._preconditioner
-        self._estimate_graph.run()
+        self._graphs["_launch_pressure_difference"].run()
         operator.product(preconditioner.work, preconditioner.r)
         norm = preconditioner.viscous_norm()
         self._viscosity.multigrid.r.zero_()  # see `_launch_estimation`
@@ -400,7 +397,7 @@ class StokesSolve:
                 goal = least if settled else max(least, TENTH * left)
                 added, left = krylov.extend(goal)
                 iterations += added
-                self._corrections.run(velocity, krylov.x)
+                self._graphs["_launch_corrections"].run(velocity, krylov.x)
                 if operator.bodies is not None:
                     operator.bodies.move(operator.layout.bodies(krylov.x))
                     moved()

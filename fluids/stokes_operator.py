@@ -46,12 +46,12 @@ import warp as wp
 from warp_lcp.fluids.pressure import PressureProjection
 from warp_lcp.fluids.stokes_bodies import StokesBodies
 from warp_lcp.fluids.stokes_kernels import stokes_kernels
-from warp_lcp.fluids.stokes_vectors import StokesLayout, WindowSums
+from warp_lcp.fluids.stokes_vectors import StokesLayout, WindowSums, launch_graphs
 from warp_lcp.fluids.viscosity import Viscosity, ViscousFields
 from warp_lcp.fluids.viscosity_bodies import ViscousWalls
 from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
-from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, copy, launch_now
+from warp_lcp.kernels.launch_graph import Launch, copy, launch_now
 from warp_lcp.kernels.launch_graph import launch as launch_recorded
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary, CutBoundary
@@ -128,19 +128,15 @@ class StokesOperator:
         self._divergences = WindowSums(self.kernels.divergence, grid)
         self._end_energy = WindowSums(self.kernels.energy, grid, grid.dimension)
         self.dissipated = self.driven = 0.0
-        # On CUDA launches contain cycles, which are programs of their own there.
-        at_once = grid.device.is_cuda
-        self._graphs = {
-            function.__name__: LaunchGraph(grid.device, function, at_once=at_once)
-            for function in (
-                self._launch_product,
-                self._launch_divergence,
-                self._launch_held,
-                self._launch_residual,
-                self._launch_differences,
-                self._launch_kinetic_energy,
-            )
-        }
+        self._graphs = launch_graphs(
+            grid.device,
+            self._launch_product,
+            self._launch_divergence,
+            self._launch_held,
+            self._launch_residual,
+            self._launch_differences,
+            self._launch_kinetic_energy,
+        )
 
     def keep_start(self, velocity: Sequence[wp.array]) -> None:
         """Store u*, the velocity before viscosity and pressure, and V* of the bodies."""
@@ -435,7 +431,7 @@ class StokesOperator:
         ux, uy, uz = three_components(velocity)
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
-        self._divergences.take(
+        self._divergences.launch(
             self.window,
             y=self.outflows,
             u=ux,
@@ -493,7 +489,7 @@ class StokesOperator:
     ) -> None:
         """Launch the sums of u'M u and u'force, of the kernel `energy`."""
         for axis in range(self.grid.dimension):
-            sums.take(
+            sums.launch(
                 self.window,
                 axis,
                 u=u[axis],

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 import warp as wp
 
 from warp_lcp.fluids.stokes_operator import StokesOperator
-from warp_lcp.fluids.stokes_vectors import WindowSums
+from warp_lcp.fluids.stokes_vectors import WindowSums, launch_graphs
 from warp_lcp.grid.staggered import three_components
 from warp_lcp.kernels.fields import zeros
-from warp_lcp.kernels.launch_graph import CommandBuffer, LaunchGraph, clear, copy
+from warp_lcp.kernels.launch_graph import CommandBuffer, clear, copy
 from warp_lcp.subproblems.grid_system import GridSystem
 
 
@@ -45,16 +45,13 @@ class StokesPreconditioner:
         self._square_of_bodies = 0.0
         self._squares = WindowSums(kernels.velocity_correction, grid, grid.dimension)
         self._pressure_square = WindowSums(kernels.correction, grid)
-        at_once = grid.device.is_cuda
-        self._graphs = {
-            function.__name__: LaunchGraph(grid.device, function, at_once=at_once)
-            for function in (
-                self._launch_velocities,
-                self._launch_right_side,
-                self._launch_pressures,
-                self._launch_set_up,
-            )
-        }
+        self._graphs = launch_graphs(
+            grid.device,
+            self._launch_velocities,
+            self._launch_right_side,
+            self._launch_pressures,
+            self._launch_set_up,
+        )
 
     def set_up(self, velocity: Sequence[wp.array]) -> None:
         """Set up the cycles, the correction c and the weights of the rows."""
@@ -157,7 +154,7 @@ class StokesPreconditioner:
         cycle.run()
         found, r, z = (self.layout.components(v) for v in (multigrid.z, self.r, self.z))
         for axis in range(self.operator.grid.dimension):
-            self._squares.take(
+            self._squares.launch(
                 operator.window,
                 axis,
                 z=z[axis],
@@ -192,7 +189,7 @@ class StokesPreconditioner:
             self._launch_right_side()
         cycle.run()
         system, shape = self._pressure, self.operator.grid.shape
-        self._pressure_square.take(
+        self._pressure_square.launch(
             self.operator.window,
             z=self.layout.pressure(self.z),
             cycle=system.z.reshape(shape),

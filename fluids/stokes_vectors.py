@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -11,6 +11,7 @@ from warp_lcp.fluids.viscosity_multigrid import ViscosityMultigrid
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import StencilKernel
+from warp_lcp.kernels.launch_graph import LaunchGraph
 
 
 class StokesLayout:
@@ -58,6 +59,18 @@ class StokesLayout:
         vector[self._bodies].assign(values.astype(np.float32))
 
 
+def launch_graphs(device: wp.Device, *functions: Callable[..., None]) -> dict[str, LaunchGraph]:
+    """Return the launch graph of each function, by the function's name.
+
+    On CUDA the functions are called in each run instead: some launch multigrid cycles, which are
+    programs of their own there.
+    """
+    return {
+        function.__name__: LaunchGraph(device, function, at_once=device.is_cuda)
+        for function in functions
+    }
+
+
 class WindowSums:
     """Reductions of a kernel that runs once, or once for each component.
 
@@ -70,9 +83,9 @@ class WindowSums:
     def __init__(self, kernel: StencilKernel, grid: StaggeredGrid, parts: int = 1) -> None:
         self._parts = [WindowReduction(kernel, grid) for _ in range(parts)]
 
-    def take(self, window: Window, part: int = 0, **arguments: object) -> None:
+    def launch(self, window: Window, part: int = 0, **arguments: object) -> None:
         """Launch a part over a window."""
-        self._parts[part].take(window, **arguments)
+        self._parts[part].launch(window, **arguments)
 
     def read(self) -> Sequence[float]:
         """Return the results of the last launches, summed over the parts."""

@@ -133,7 +133,7 @@ class SurfaceTension:
         self._calming = LaunchGraph(grid.device, self._launch_velocity_damping, at_once=shared)
         self._measuring = LaunchGraph(
             grid.device,
-            lambda kind: self._energy.take(self._cells, self._faces(kind), self._shares),
+            lambda kind: self._energy.launch(self._cells, self._faces(kind), self._shares),
         )
         self._find_walls()
 
@@ -185,7 +185,11 @@ class SurfaceTension:
     def _push(
         self, velocity: Sequence[wp.array], window: Window, kind: wp.array, passes: int
     ) -> None:
-        """Launch the kernels of `act`."""
+        """Launch the kernels of `act`.
+
+        The jump of the pressure is `scale` times the curvature on the surface. A contact angle
+        first tilts the extension of the surface into walls, on which the curvature depends.
+        """
         grid, planes, bend = self.grid, self.grid.planes, self._bend
         self._find_curvature(window, passes)
         if self._cosine != 0.0:  # the extension into walls depends on the curvature
@@ -316,6 +320,7 @@ class SurfaceTension:
     ) -> wp.array:
         """Return the source after binomial passes, in one of two free fields.
 
+        A pass is the mean with weights (1, 2, 1)/4 along each axis.
         `before` passes have been applied to the source already.
         """
         self._continue(source, before, self._cosine)

@@ -151,7 +151,7 @@ class UnilateralPressure(PressureProjection):
         self.grid.domain.launch(
             kernels.prepare_kernel, [self._at(velocity), *numbers, self.kind, *fields]
         )
-        self._count.take(self._cells, kind=self._unknown)
+        self._count.launch(self._cells, kind=self._unknown)
 
     def project(
         self,

@@ -303,7 +303,7 @@ class Viscosity:
             )
             self._graphs["_take_solution"].run(velocity, self._solver.x, variant=self._solver.x.ptr)
             norm, lost, driven, _ = self._force(fields, changed=True)
-            iterations += self._solver.found()[0]  # read together with the force
+            iterations += self._solver.read()[0]  # read together with the force
             if not norm < 0.5 * before:  # the limit of float32
                 break
         if last:
@@ -690,7 +690,7 @@ class Viscosity:
             others = (fine.of_others(axis, fields) for fields in (velocity, distance, solids))
             (ub, uc), (db, dc), (solid_b, solid_c) = others
             wall, turn, shift = self._motion(axis)
-            self._sums[axis].take(
+            self._sums[axis].launch(
                 self._unknowns,
                 fine.rows(axis),
                 self.grid.placement,

@@ -93,11 +93,14 @@ class ViscosityMultigrid:
         part = subdomain_of(last.grid)
         whole, first = self._gathered.cycle, self._gathered.levels[0]
         gather = Launches(partial(perform, partial(part.collect, last.b, first.b)))
-        take = Launches(partial(perform, partial(_take_part, last, first)))
+        copy_part = Launches(partial(perform, partial(_copy_part, last, first)))
         return Cycle(
             self.levels,
             GatheredLevel(
-                whole=lambda projected: whole, gather=[gather], gather_bounds=[], take=take
+                whole=lambda projected: whole,
+                gather=[gather],
+                gather_bounds=[],
+                copy_part=copy_part,
             ).solve,
         )
 
@@ -152,8 +155,8 @@ class ViscosityMultigrid:
             self._gathered.set_up()
 
 
-def _take_part(level: ViscosityLevel, whole: ViscosityLevel) -> None:
+def _copy_part(level: ViscosityLevel, whole: ViscosityLevel) -> None:
     """Copy this rank's part of the whole grid's solution, with ghost cells."""
     part = subdomain_of(level.grid)
     for x, of_whole in zip(level.x, whole.x, strict=True):
-        part.take(of_whole, x)
+        part.copy_part(of_whole, x)

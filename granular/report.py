@@ -96,7 +96,7 @@ class SandReport:
     def _launch_report(self) -> None:
         """Launch the sums of the log values over all cells."""
         stress, p = self.stress, self.stress.packing
-        self._report.take(
+        self._report.launch(
             p.counted,
             p.fields,
             stress.checked.fields,

@@ -109,7 +109,10 @@ class ParticlePercentiles:
             self._reading.changed()
 
     def _launch(self, particles: Particles) -> None:
-        """Launch the selection, four digits from the highest on."""
+        """Launch the selection of 32-bit numbers: four digits of 8 bits, from the highest on.
+
+        `mask` has the bits of the digits found so far. Digit 3 counts (x >> 24) & 255, and so on.
+        """
         mask = 0
         for shift in range(32 - BITS, -1, -BITS):
             digits = [wp.uint32(mask), wp.uint32(shift)]

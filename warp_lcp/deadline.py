@@ -84,12 +84,12 @@ def time_is_up() -> bool:
 
 
 def check_time() -> None:
-    """Raise TimeIsUp if the current solve has no time left.
+    """Raise DeadlineReached if the current solve has no time left.
 
     The work of the current step is discarded.
 
     Raises:
-        TimeIsUp: the time limit is reached.
+        DeadlineReached: the time limit is reached.
     """
     if time_is_up():
         raise DeadlineReached

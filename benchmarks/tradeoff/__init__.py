@@ -17,10 +17,10 @@ from warp_lcp.benchmarks.tradeoff.charts import (
     solve_chart,
     solve_table,
 )
-from warp_lcp.benchmarks.tradeoff.runs import FRAMES, Runs
+from warp_lcp.benchmarks.tradeoff.runs import Runs
 from warp_lcp.benchmarks.tradeoff.settings import TradeoffSetting, settings_of
 from warp_lcp.benchmarks.tradeoff.solves import measure_solves
-from warp_lcp.scene.presets import PRESETS, price_table
+from warp_lcp.scene.presets import PRESETS, TRIAL_FRAMES, price_table
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.simulation import StepFailed
 
@@ -38,7 +38,7 @@ def measure(options: Options, out: Path) -> Results:
         resolution = max(
             options.sizes, default=SCENES.get(name) or load_scene(name).domain.resolution
         )
-        frames = FRAMES if resolution > QUICK else QUICK_FRAMES
+        frames = TRIAL_FRAMES if resolution > QUICK else QUICK_FRAMES
         _measure_scene(name, resolution, frames, options, results)
     return results
 

@@ -19,8 +19,6 @@ from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
-FRAMES = 18
-
 
 @dataclass
 class TradeoffRun:

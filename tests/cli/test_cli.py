@@ -3,6 +3,8 @@
 import json
 import re
 import signal
+import subprocess
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +17,7 @@ from command_line import invoke
 from warp_lcp.cli import commands as cli
 from warp_lcp.cli import view_commands
 from warp_lcp.cli.suites import benchmarks, suite_names
+from warp_lcp.extras import live
 from warp_lcp.scene import simulator
 from warp_lcp.simulation import SimulationFailed
 
@@ -22,6 +25,17 @@ from warp_lcp.simulation import SimulationFailed
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
     return tmp_path / "out"
+
+
+def test_the_command_line_loads_no_simulator_before_a_command_runs():
+    """Modules of a new process that imports the commands: help and completion need no others."""
+    heavy = ("warp_lcp.grid", "warp_lcp.material", "warp_lcp.run.loop", "warp_lcp.render.render")
+    code = (
+        "import sys, warp_lcp.cli.commands;"
+        f"print(*[name for name in sys.modules if name.startswith({heavy})])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
 
 
 def test_run(scene_file, out):
@@ -39,7 +53,7 @@ def test_a_run_is_shown_from_its_start(page, window, tmp_path, monkeypatch):
     """Page and window of a run in progress: opened at its start, each on request only."""
     notes, events, opened = [], [], []
     observer = SimpleNamespace(note=notes.append, start=lambda *times: events.append(times))
-    monkeypatch.setattr(view_commands, "served", lambda folder: nullcontext("http://here"))
+    monkeypatch.setattr(live, "served", lambda folder, *, port: nullcontext("http://here"))
     monkeypatch.setattr(
         view_commands.subprocess, "Popen", lambda command, **options: opened.append(command[-2:])
     )

@@ -17,7 +17,7 @@ from command_line import succeed
 from default_run import chosen, few
 from particle_scenes import particle_scenes, stepped_by_default
 from scenes_of_every_table import MOTIONS, SHAPES, SIDES, scene_of_every_table
-from warp_lcp.cli import view_commands as shown
+from warp_lcp.extras.live import LiveServer
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
@@ -98,7 +98,7 @@ def nobody_waits(monkeypatch: pytest.MonkeyPatch) -> None:
     def end(server: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(shown.live_server.__globals__["LiveServer"], "serve_forever", end)
+    monkeypatch.setattr(LiveServer, "serve_forever", end)
 
 
 def written(seed: int, tmp_path: Path) -> Path:

@@ -30,7 +30,7 @@ from warp_lcp.extras.live import (
 )
 from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.frames.vtu import read_vtu
-from warp_lcp.render.recording import RenderError
+from warp_lcp.render.image_content import RenderError
 from warp_lcp.simulation import Points
 
 SOLID = "[[solid]]\nshape = 'sphere'\ncenter = [0.5, 0.5]\nradius = 0.2\n"
@@ -312,5 +312,5 @@ def test_a_run_goes_on_without_a_page(tmp_path, monkeypatch):
         raise RenderError("--port 0: cannot be used: Too many open files; 0: any free port")
 
     monkeypatch.setattr(live, "live_server", refuse)
-    with live.served(tmp_path) as address:
+    with live.served(tmp_path, port=0) as address:
         assert address.startswith("none (--port 0: cannot be used: Too many open files")

@@ -14,7 +14,7 @@ from small_liquids import GRAVITY, scene
 from small_runs import ball, box, run_into, write_run
 from warp_lcp.extras.usd import INSTALL, export_run, usd_suffix
 from warp_lcp.frames.frame_folder import FrameFolder
-from warp_lcp.render.recording import RenderError, VisiblePart
+from warp_lcp.render.image_content import RenderError, VisiblePart
 from warp_lcp.simulation import Points, Surface
 
 pytest.importorskip("pxr", reason="export needs usd-core, the extra `usd`")

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 
 from warp_lcp.cli.commands import app
 from warp_lcp.frames.nvdb import LEAF, LEAF_NODE
-from warp_lcp.render.recording import Color, Recording
+from warp_lcp.render.image_content import Color
+from warp_lcp.render.recording import Recording
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 

@@ -64,7 +64,7 @@ def test_kernels_on_windows_have_the_results_of_kernels_on_all_cells(tables, mon
 def test_cost_of_pressure_and_fragments_scales_with_the_liquid(monkeypatch):
     """Visited cells of passes in a domain eight times as wide."""
     visited = [Counter[str]()]
-    run, take = Window.run, WindowReduction.take
+    run, launch = Window.run, WindowReduction.launch
     # Launches at once, each of which reports the cells that it visits.
     monkeypatch.setattr(
         LaunchGraph, "run", lambda graph, *arguments, variant=None: graph._record(*arguments)
@@ -81,10 +81,10 @@ def test_cost_of_pressure_and_fragments_scales_with_the_liquid(monkeypatch):
 
     def tallied(tally: WindowReduction, window: Window, *structs: Any, **given: Any) -> None:
         count(tally, window)
-        take(tally, window, *structs, **given)
+        launch(tally, window, *structs, **given)
 
     monkeypatch.setattr(Window, "run", counted)
-    monkeypatch.setattr(WindowReduction, "take", tallied)
+    monkeypatch.setattr(WindowReduction, "launch", tallied)
     for width in (1.0, 8.0):
         simulation = thrown({}, round(64 * width), width)
         simulation.step(0.001)

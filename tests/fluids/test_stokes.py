@@ -356,7 +356,7 @@ def test_energies_are_sums_over_the_cells_of_the_window(dimension: int) -> None:
     fields = {"u": u, "force": force, "volume": volume, "diagonal": diagonal}
     kernels = stokes_kernels(cut=True, moving=False, ghost=True, varies=False, bounded=True)
     reduction = WindowReduction(kernels.energy, grid)
-    reduction.take(
+    reduction.launch(
         grid.domain, **{name: wp.array(field, device="cpu") for name, field in fields.items()}
     )
     inside = np.zeros(grid.shape, dtype=bool)

@@ -34,7 +34,8 @@ from warp_lcp.frames.meshio_format import (
 )
 from warp_lcp.frames.vti import write_vti
 from warp_lcp.frames.vtu import VtuMesh, mesh_of, read_vtu, write_vtu
-from warp_lcp.render.recording import Color, Recording, RenderError
+from warp_lcp.render.image_content import Color, RenderError
+from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import ImageStyle, render_run
 from warp_lcp.run.check import check_ranks, check_scene
 from warp_lcp.run.progress import ProgressLines

@@ -10,7 +10,8 @@ from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.frames.pieces import describe, one_grid, piece_files, write_whole
 from warp_lcp.frames.vtu import VtuMesh
 from warp_lcp.render import recording
-from warp_lcp.render.recording import Color, Recording, RenderError
+from warp_lcp.render.image_content import Color, RenderError
+from warp_lcp.render.recording import Recording
 from warp_lcp.run.folder import OutputError, RunFolder, RunRecord
 from warp_lcp.run.rank_frames import RankFrames
 from warp_lcp.scene.scene_file import dump_scene, load_scene

@@ -15,7 +15,8 @@ from told import costly, limited
 
 from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.frames.pieces import describe, write_whole
-from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
+from warp_lcp.render.image_content import Color, RenderError, VisiblePart
+from warp_lcp.render.recording import Recording
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import Cells, Part, Points, Surface
 

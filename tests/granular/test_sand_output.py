@@ -10,7 +10,8 @@ import pytest
 
 from command_line import invoke
 from small_sands import box, create, scene
-from warp_lcp.render.recording import Color, Recording
+from warp_lcp.render.image_content import Color
+from warp_lcp.render.recording import Recording
 
 SMALL = ["--set", "domain.resolution=24", "--set", "time.duration=0.1", "--device", "cpu"]
 

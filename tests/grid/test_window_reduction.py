@@ -32,9 +32,9 @@ def test_windows_are_added_up(counts: tuple[int, int, int]) -> None:
         window = grid.window(corners[0], corners[1], grow=1).common(grid.domain)
         assert window is not None
         box = tuple(map(slice, window.low, window.high))
-        crowd.take(window, **arrays, most=1.2)
-        all.take(window, **arrays, most=1.2)
-        count.take(window, kind=arrays["base"])
+        crowd.launch(window, **arrays, most=1.2)
+        all.launch(window, **arrays, most=1.2)
+        count.launch(window, kind=arrays["base"])
         has = (base[box] != SOLID) & (density[box] > 0.0)
         over = np.where(has, density[box] - np.float32(1.2) * capacity[box], 0.0)
         expected = [

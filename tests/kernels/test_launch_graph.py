@@ -88,7 +88,7 @@ def test_a_recorded_window_is_that_of_the_run(threads, sparse):
     def launch() -> None:
         active.clear(field)
         accelerate(active, [field], [weight], [change])
-        recorded.take(active, kind=kind)
+        recorded.launch(active, kind=kind)
 
     change.value = 1.0
     graph = LaunchGraph(GRID.device, launch)
@@ -101,7 +101,7 @@ def test_a_recorded_window_is_that_of_the_run(threads, sparse):
         graph.run(variant=sparse)
         now.clear(other)
         accelerate(now, [other], [weight], [change.value])
-        direct.take(now, kind=kind)
+        direct.launch(now, kind=kind)
         np.testing.assert_array_equal(field.numpy(), other.numpy())
         assert recorded.read() == direct.read()
 
@@ -280,7 +280,7 @@ def test_rows_are_added_up_pairwise(counts):
         corners = np.sort(rng.integers(1, np.array(counts) + 1, (2, 3)), axis=0)
         box = grid.window(corners[0], corners[1])
         for found, counted in ((tally, box), (all_cells, grid.domain)):
-            found.take(box, **fields, most=1.2)
+            found.launch(box, **fields, most=1.2)
             rows = box.rows[0] * box.rows[1]
             parts = found._partials.numpy()[: 2 * rows].reshape(2, *box.rows)
             inside = np.zeros((2, *grid.shape[:2]))

@@ -12,7 +12,7 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
-from warp_lcp.kernels import Rows, layout
+from warp_lcp.kernels import Rows, rows
 from warp_lcp.kernels.fields import Padding
 from warp_lcp.kernels.kernel_file import KernelFile
 from warp_lcp.kernels.layout import copy_of, put
@@ -34,8 +34,8 @@ def checked(monkeypatch, request):
     """
     from benchmarks import emulated_cuda
 
-    monkeypatch.setattr(layout, "MANY_CELLS_OF_BLOCKS", request.param)
-    layout._flat.cache_clear()
+    monkeypatch.setattr(rows, "MANY_CELLS_OF_BLOCKS", request.param)
+    rows._flat.cache_clear()
     monkeypatch.setattr(
         emulated_cuda.context,
         "invoke",
@@ -45,7 +45,7 @@ def checked(monkeypatch, request):
     emulated_cuda.launched_by_cells.clear()
     yield emulated_cuda.launched_by_cells, emulated_cuda.otherwise
     emulated_cuda.otherwise.clear()
-    layout._flat.cache_clear()
+    rows._flat.cache_clear()
 
 
 def drawn_problem(seed):

@@ -14,6 +14,7 @@ import warp_lcp as wl
 from code_blocks import blocks, run
 from oracle import assemble
 from warp_lcp.kernels import FusedKernel, PrecomputedProduct, Rows, StencilKernel, layout
+from warp_lcp.kernels import rows as kernel_rows
 from warp_lcp.kernels.fields import Padding
 from warp_lcp.kernels.header_text import text
 
@@ -136,7 +137,7 @@ def test_slabs_chunks_and_spans_share_the_same_cells_out(product, monkeypatch, c
     s = A.stencil
     product.bind(Rows.of(s.padding, s.device), stencil=s, x=x, y=whole, out=out).launch()
     total = out.numpy().sum()
-    monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 2)
+    monkeypatch.setitem(kernel_rows.PLANES_A_THREAD, "cpu", 2)
     rows = Rows.of(s.padding, s.device)
     rows.summed.grain, rows.summed.chunks = -(-37 // chunks), chunks
     monkeypatch.undo()

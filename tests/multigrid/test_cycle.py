@@ -284,7 +284,7 @@ def test_a_gathered_levels_cycle_is_that_of_the_whole():
         whole=lambda projected: whole,
         gather=["gather b"],
         gather_bounds=["gather bounds"],
-        take="take",
+        copy_part="copy part",
     )
     found = list(Cycle(levels[:2], gathered.solve, projected=True).stages())
-    assert found == [*W[:2], "gather b", "gather bounds", *W[2:-1], "take", W[-1]]
+    assert found == [*W[:2], "gather b", "gather bounds", *W[2:-1], "copy part", W[-1]]

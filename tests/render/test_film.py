@@ -9,7 +9,7 @@ import pytest
 from command_line import invoke
 from small_runs import ball, write_run
 from warp_lcp.render.film import Film, check_rate, film_suffix
-from warp_lcp.render.recording import RenderError
+from warp_lcp.render.image_content import RenderError
 
 Image = pytest.importorskip(
     "PIL.Image", reason="films need Pillow, which comes with the extra `render`"

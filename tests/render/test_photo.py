@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from small_runs import ball, box, write_run
 from warp_lcp.cli import commands as cli
+from warp_lcp.render.image_content import RenderError, VisiblePart
 from warp_lcp.render.photo import photo
 from warp_lcp.render.photo.mitsuba_renderer import (
     INSTALL,
@@ -40,7 +41,7 @@ from warp_lcp.render.photo.photo_scene import (
     particle_surface,
     rigid_pose,
 )
-from warp_lcp.render.recording import Recording, RenderError, VisiblePart
+from warp_lcp.render.recording import Recording
 from warp_lcp.simulation import Points, Surface
 
 ROOM = (1.0, 1.0, 1.0)

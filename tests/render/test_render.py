@@ -14,17 +14,10 @@ from small_runs import ball
 from warp_lcp.extras.live import LiveRun
 from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.render.actors import shaded
+from warp_lcp.render.image_content import Color, RenderError, VisiblePart
 from warp_lcp.render.page import Page
 from warp_lcp.render.picture import Picture
-from warp_lcp.render.recording import (
-    Color,
-    ColorScale,
-    Recording,
-    RenderError,
-    VisiblePart,
-    _round_up,
-    spread,
-)
+from warp_lcp.render.recording import ColorScale, Recording, _round_up, spread
 from warp_lcp.render.render import INSTALL, ImageStyle, expected_seconds, parse_size, render_run
 from warp_lcp.render.solid_meshes import Outline
 from warp_lcp.scene.camera import MARGIN, viewpoint

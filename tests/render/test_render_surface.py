@@ -6,7 +6,8 @@ import pytest
 from command_line import invoke
 from small_runs import ball, box, sphere, write_run
 from warp_lcp.render.actors import is_round, surface_meshes
-from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
+from warp_lcp.render.image_content import Color, RenderError, VisiblePart
+from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import ImageStyle, render_run
 from warp_lcp.render.solid_meshes import prescribed_solids
 from warp_lcp.scene.camera import MARGIN

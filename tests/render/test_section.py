@@ -7,7 +7,7 @@ import pytest
 
 from command_line import invoke
 from small_runs import ball, sphere, write_run
-from warp_lcp.render.recording import Color, RenderError, VisiblePart
+from warp_lcp.render.image_content import Color, RenderError, VisiblePart
 from warp_lcp.render.render import INSTALL_MATPLOTLIB, ImageStyle, render_run
 from warp_lcp.render.section import cut
 from warp_lcp.simulation import Cells, Points, Surface

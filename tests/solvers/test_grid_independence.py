@@ -5,7 +5,7 @@ import pytest
 
 import warp_lcp as wl
 from warp_lcp.benchmarks import problems
-from warp_lcp.kernels import layout
+from warp_lcp.kernels import rows
 from warp_lcp.kernels import thread_pool as team
 from warp_lcp.multigrid.stencil_level import StencilLevel
 
@@ -147,7 +147,7 @@ def test_every_way_to_launch_gives_the_same_iterates(bounds, monkeypatch):
     monkeypatch.setattr(StencilLevel, "fuses", False)
     _, unfused = solve(24, bounds, "multigrid")
     np.testing.assert_array_equal(unfused.x.numpy(), plain.x.numpy())
-    monkeypatch.setitem(layout.PLANES_A_THREAD, "cpu", 5)
+    monkeypatch.setitem(rows.PLANES_A_THREAD, "cpu", 5)
     _, slabs = solve(24, bounds, "multigrid")
     monkeypatch.undo()
     monkeypatch.setattr(team.STATE, "team", None)

@@ -1,4 +1,8 @@
-"""Command line: the program `warp-lcp` and its commands."""
+"""Command line: the program `warp-lcp` and its commands.
+
+A command imports simulators, renderers and methods when it runs, so that help texts, completion and
+messages about wrong arguments come at once.
+"""
 
 from __future__ import annotations
 
@@ -9,42 +13,31 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 import warp as wp
 
 from warp_lcp.cli.exit_codes import FAILED, WRONG_INPUT, end, wrong_input
-from warp_lcp.cli.solve_file import FileOutcome, solve_files
-from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
 from warp_lcp.cli.suites import benchmarks, suite_names
 from warp_lcp.cli.view_commands import export, render, serve, show_while_running, view
 from warp_lcp.default_chain import default_chain
-from warp_lcp.distributed.watchdog import LIMIT
-from warp_lcp.extras.viewer import check_window
 from warp_lcp.files import Tables
 from warp_lcp.kernels.thread_pool import get_threads, set_threads
-from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.problem.operator_protocol import families
-from warp_lcp.run.check import check_memory, check_scene, start
-from warp_lcp.run.devices import Engine, choose_device, cuda_driver, devices, versions
-from warp_lcp.run.estimate import doubts, estimate_run
-from warp_lcp.run.folder import BEFORE, OutputError, RunRecord, mark_ended
-from warp_lcp.run.interruption import Interruption
-from warp_lcp.run.launcher import Launcher, default_folder
-from warp_lcp.run.loop import RunRequest
-from warp_lcp.run.problem_folder import ProblemError
-from warp_lcp.run.profile import Profiler
-from warp_lcp.run.progress import ProgressBar, ProgressLines
+from warp_lcp.run.devices import RANK_TIMEOUT, Engine, choose_device, cuda_driver, devices, versions
 from warp_lcp.run.terminal import CommandGroup, Terminal, print_lines, print_text, table_lines
-from warp_lcp.run.trial import step_seconds
-from warp_lcp.run.tune import FRAMES, TuningResult, tune, write_tuned
-from warp_lcp.scene.presets import PresetName
-from warp_lcp.scene.scene_file import built_in_scenes, fix_file, installed_simulators, load_scene
+from warp_lcp.scene.presets import TRIAL_FRAMES, PresetName
 from warp_lcp.settings import nearest
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 from warp_lcp.solvers.projected_multigrid import ProjectedMultigrid
 from warp_lcp.solvers.registry import METHODS
+
+if TYPE_CHECKING:
+    from warp_lcp.cli.solve_file import FileOutcome
+    from warp_lcp.run.folder import RunRecord
+    from warp_lcp.run.launcher import Launcher
+    from warp_lcp.run.tune import TuningResult
 
 RANKED_SUITE = "scaling"  # suite of `bench --engine petsc`
 
@@ -69,6 +62,8 @@ def launcher_of(engine: Engine, *, rank_timeout: float) -> Iterator[Launcher]:
     Raises:
         EngineError: the engine cannot be used here.
     """
+    from warp_lcp.run.launcher import Launcher
+
     if engine is Engine.SINGLE:
         yield Launcher()
         return
@@ -84,6 +79,8 @@ def _matching_names(word: str, names: Iterable[str]) -> list[str]:
 
 def _scenes_alike(incomplete: str) -> list[str]:
     """Return completions of a scene: built-in scenes, scene files and folders."""
+    from warp_lcp.scene.scene_file import built_in_scenes
+
     near = (
         sorted(Path().glob(f"{glob.escape(incomplete)}*"))
         if not Path(incomplete).is_absolute()
@@ -237,11 +234,19 @@ def run(
         bool, typer.Option("--view", help="Show the run in a window, as `view` does.")
     ] = False,
     engine: EngineOption = Engine.SINGLE,
-    rank_timeout: RankTimeout = LIMIT,
+    rank_timeout: RankTimeout = RANK_TIMEOUT,
     threads: ThreadsOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Simulate a scene; ParaView opens the frames in the run folder."""
+    from warp_lcp.extras.viewer import check_window
+    from warp_lcp.run.folder import BEFORE, OutputError, mark_ended
+    from warp_lcp.run.interruption import Interruption
+    from warp_lcp.run.launcher import default_folder
+    from warp_lcp.run.loop import RunRequest
+    from warp_lcp.run.profile import Profiler
+    from warp_lcp.run.progress import ProgressBar, ProgressLines
+
     options = {
         "--out": out,
         "--device": device,
@@ -320,6 +325,12 @@ def check(
     overrides: SetOption = None,
 ) -> None:
     """Validate a scene; estimate memory and run time; list suspicious settings."""
+    from warp_lcp.material.particle_scene import ParticleScene
+    from warp_lcp.run.check import check_memory, check_scene, start
+    from warp_lcp.run.estimate import doubts, estimate_run
+    from warp_lcp.run.trial import step_seconds
+    from warp_lcp.scene.scene_file import fix_file
+
     with wrong_input():
         chosen_device = choose_device(device)
         if fix:
@@ -359,7 +370,7 @@ def tune_scene(
     ] = "standard",
     frames: Annotated[
         int, typer.Option(min=1, metavar="N", help="Number of frames of each trial run.")
-    ] = FRAMES,
+    ] = TRIAL_FRAMES,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="File for the tuned scene.", show_default=False),
@@ -371,6 +382,11 @@ def tune_scene(
     overrides: SetOption = None,
 ) -> None:
     """Find the fastest settings of a scene for an accuracy, by short trial runs."""
+    from warp_lcp.run.check import check_memory
+    from warp_lcp.run.folder import OutputError
+    from warp_lcp.run.tune import tune, write_tuned
+    from warp_lcp.scene.scene_file import load_scene
+
     with wrong_input():
         chosen_device = choose_device(device)
         loaded = load_scene(scene, overrides or ())
@@ -398,6 +414,8 @@ def tune_scene(
 @app.command()
 def scenes() -> None:
     """List the built-in scenes with their descriptions."""
+    from warp_lcp.scene.scene_file import built_in_scenes, load_scene
+
     with wrong_input():
         _print_pairs([(name, load_scene(name).scene.description) for name in built_in_scenes()])
 
@@ -409,6 +427,8 @@ def schema(
     ] = "fluids",
 ) -> None:
     """Print the JSON schema of scene files, for editors and other programs."""
+    from warp_lcp.scene.scene_file import installed_simulators
+
     with wrong_input():
         installed = installed_simulators()
     if simulator not in installed:
@@ -486,9 +506,13 @@ def solve(
         str, typer.Option(help="cpu or cuda:N; with --engine petsc: cpu or cuda.")
     ] = "cpu",
     engine: EngineOption = Engine.SINGLE,
-    rank_timeout: RankTimeout = LIMIT,
+    rank_timeout: RankTimeout = RANK_TIMEOUT,
 ) -> None:
     """Solve y = A x + b, lower <= x <= upper, from files or a recorded problem."""
+    from warp_lcp.cli.solve_file import solve_files
+    from warp_lcp.cli.solve_recorded import SUFFIX, check_recorded, file_digest, solve_recorded
+    from warp_lcp.run.problem_folder import ProblemError
+
     options: Tables = {
         "method": method,
         "tolerance": tolerance,
@@ -595,6 +619,8 @@ def bench(
 
     First prints the expected time on two cores and the packages needed.
     """
+    from warp_lcp.scene.scene_file import load_scene
+
     installed = benchmarks()
     if suite not in installed:
         end(f"{suite}: no such suite; {nearest(suite, installed)}", WRONG_INPUT)
@@ -639,6 +665,8 @@ def bench(
 @app.command()
 def info() -> None:
     """Print versions, devices, simulators and the default method on grids."""
+    from warp_lcp.scene.scene_file import installed_simulators
+
     lines = list(versions().items())
     lines += [(f"device {alias}", text) for alias, text in devices().items()]
     with wrong_input():

@@ -12,7 +12,6 @@ import typer
 
 from warp_lcp.run.interruption import RunInterrupted
 from warp_lcp.run.terminal import print_lines
-from warp_lcp.scene.renamed_keys import RenamedKeyWarning
 from warp_lcp.simulation import InputError
 
 FAILED = 1
@@ -23,6 +22,8 @@ _SHOW = warnings.showwarning
 @contextmanager
 def wrong_input() -> Iterator[None]:
     """Print input errors in one line and exit; print renamed scene keys and continue."""
+    from warp_lcp.scene.renamed_keys import RenamedKeyWarning
+
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", RenamedKeyWarning)
@@ -51,6 +52,8 @@ def _show_renamed_keys(
     line: str | None = None,
 ) -> None:
     """Print a warning about a renamed key as one line; others as Python does."""
+    from warp_lcp.scene.renamed_keys import RenamedKeyWarning
+
     if issubclass(category, RenamedKeyWarning):
         print_lines(str(message), error=True)
     else:

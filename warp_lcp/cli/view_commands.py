@@ -1,4 +1,7 @@
-"""Commands that show or convert a run: render, view, serve, export."""
+"""Commands that show or convert a run: render, view, serve, export.
+
+Each imports its renderer when it runs.
+"""
 
 from __future__ import annotations
 
@@ -11,30 +14,20 @@ from datetime import timedelta
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from warp_lcp.cli.exit_codes import wrong_input
-from warp_lcp.extras.live import PORT, live_server, served
-from warp_lcp.extras.usd import export_run
-from warp_lcp.extras.viewer import view_run
-from warp_lcp.render.film import check_rate
-from warp_lcp.render.photo.photo import (
-    SAMPLES,
-    SHUTTER,
-    PhotoSettings,
-    frame_range,
-    photograph_film,
-    photograph_run,
-)
-from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart
-from warp_lcp.render.render import ImageStyle, film_run, parse_size, render_run
+from warp_lcp.render.image_content import Color, RenderError, VisiblePart
 from warp_lcp.run.devices import devices
-from warp_lcp.run.log import Value
-from warp_lcp.run.progress import Observer, ProgressCounter
 from warp_lcp.run.terminal import Terminal, print_lines, print_text
 
+if TYPE_CHECKING:
+    from warp_lcp.run.log import Value
+    from warp_lcp.run.progress import Observer
+
+PORT = 8765  # default port of a run's page
 RunArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Run folder.")]
 ShowOption = Annotated[
     VisiblePart | None,
@@ -145,6 +138,19 @@ def render(
 
     Needs the extra `render` or `photo`.
     """
+    from warp_lcp.render.film import check_rate
+    from warp_lcp.render.photo.photo import (
+        SAMPLES,
+        SHUTTER,
+        PhotoSettings,
+        frame_range,
+        photograph_film,
+        photograph_run,
+    )
+    from warp_lcp.render.recording import Recording
+    from warp_lcp.render.render import ImageStyle, film_run, parse_size, render_run
+    from warp_lcp.run.progress import ProgressCounter
+
     # Starts Warp, which draws surfaces and samples 2-D solids, without its native messages.
     devices()
     console = Terminal(stderr=True)
@@ -264,6 +270,9 @@ def view(
 
     Needs a display and the extra `render`.
     """
+    from warp_lcp.extras.viewer import view_run
+    from warp_lcp.render.render import ImageStyle
+
     devices()
     with wrong_input():
         view_run(folder, ImageStyle(color=color, show=show, overrides=overrides or ()))
@@ -280,6 +289,8 @@ def serve(
     show: ShowOption = None,
 ) -> None:
     """Show a run on a web page, also while it is in progress; Ctrl-C ends it."""
+    from warp_lcp.extras.live import live_server
+
     devices()
     with wrong_input():
         if not folder.is_dir():
@@ -319,6 +330,9 @@ def export(
 
     Needs the extra `usd`.
     """
+    from warp_lcp.extras.usd import export_run
+    from warp_lcp.run.progress import ProgressCounter
+
     devices()
     with wrong_input(), ProgressCounter(Terminal(stderr=True), "writing", "frames") as told:
         count = len(
@@ -359,11 +373,13 @@ def show_while_running(
 
     The window runs in another process, and stays open.
     """
+    from warp_lcp.extras.live import served
+
     with ExitStack() as stack:
 
         def begin() -> None:
             if page:
-                observer.note(f"page: {stack.enter_context(served(folder))}")
+                observer.note(f"page: {stack.enter_context(served(folder, port=PORT))}")
             if window:
                 program = "from warp_lcp.cli.commands import main; main()"
                 subprocess.Popen(

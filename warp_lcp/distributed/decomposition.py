@@ -153,7 +153,8 @@ class Decomposition:
     def coarser(self, factors: Triple) -> Decomposition | None:
         """Return the decomposition of aggregates of cells along x, y, z.
 
-        Returns None if a box boundary would cut an aggregate, or a rank would have no cells.
+        A box of m cells along an axis has ceil(m / factor) aggregates. Returns None if a box
+        boundary would cut an aggregate, or a rank would have no cells.
         """
         new = []
         for part, factor in zip(self.parts, factors, strict=True):
@@ -269,7 +270,8 @@ def parts(n: int, p: int) -> list[int]:
 def _processes(counts: Triple, size: int) -> Triple:
     """Return the ranks along x, y, z with the fewest cells at cuts.
 
-    Among equals, the numbers that cut z are chosen: planes of constant z are contiguous.
+    These are (px - 1) ny nz + (py - 1) nx nz + (pz - 1) nx ny cells, one for each cut face. Among
+    equals, the numbers that cut z are chosen: planes of constant z are contiguous.
     """
     nx, ny, nz = counts
     candidates = [

@@ -277,15 +277,15 @@ class GridGather:
             partial(exchange_operation, self._forest, own_part.numpy(), whole.numpy()),
         )
 
-    def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:
+    def copy_part(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = launch_now) -> None:
         """Write this rank's part of the whole grid's field to its own, with ghost cells."""
         given = [whole.reshape(self._whole), mine.reshape(self._shape), *self._low]
-        launch(take_kernel, self._shape[:2], given, device=mine.device)
+        launch(copy_part_kernel, self._shape[:2], given, device=mine.device)
 
 
 @forward_kernel(module="warp_lcp.distributed.halo")
 @no_type_check
-def take_kernel(
+def copy_part_kernel(
     whole: wp.array3d(dtype=Any), mine: wp.array3d(dtype=Any), k0: int, j0: int, i0: int
 ):
     """Copy a row of a box."""
@@ -295,7 +295,7 @@ def take_kernel(
 
 
 for _T in (wp.float32, wp.float64):
-    wp.overload(take_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T), int, int, int])
+    wp.overload(copy_part_kernel, [wp.array3d(dtype=_T), wp.array3d(dtype=_T), int, int, int])
 
 
 class StarForest:

@@ -108,7 +108,8 @@ class ParticleMessages:
         """Set the search boxes; return the number of particles for each neighbor.
 
         This rank comes last. A neighbor needs the particles in its box and within REACH of it, at
-        every periodic shift; this rank itself needs those at nonzero shifts.
+        every periodic shift; this rank itself needs those at nonzero shifts. Boxes are in cells,
+        the offsets shift dx of the positions in m.
         """
         part, joined, own_rank = self.part, self.part.decomposition.joined, self.part.ranks.rank
         counts, origin = np.array(part.grid.counts), np.array(part.grid.origin)
@@ -133,7 +134,8 @@ class ParticleMessages:
     def exchange(self, *, positions_only: bool) -> int:
         """Exchange particles with the neighbors; return how many have arrived; collective.
 
-        Arrived particles are stored behind the others.
+        Arrived particles are stored behind the others. A message has 2 words of 4 bytes for each
+        particle, and 3 for each of its columns that are sent.
 
         Args:
             positions_only: send positions and places alone.

@@ -497,7 +497,7 @@ class Subdomain(GridPart):
             if field.device.is_cuda:
                 field.assign(host)
 
-    def take(self, whole: wp.array, field: wp.array) -> None:
+    def copy_part(self, whole: wp.array, field: wp.array) -> None:
         """Write this part's values of a whole-grid field to a field of the part."""
         wp.copy(field, whole[self._cells(self.box).grown(1).moved((1, 1, 1)).slices])
 

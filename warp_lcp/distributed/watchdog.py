@@ -21,7 +21,6 @@ from warp_lcp.distributed.interruptible_wait import InterruptibleWait, waiting
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.files.atomic import SUFFIX, open_in_place
 
-LIMIT = 600.0  # seconds: compilation of kernels and the largest frames take less
 BEATS = 20  # heartbeats within the limit, which is checked as often
 LONGEST_BEAT = 30.0  # seconds
 # Beats, and seconds, after which a rank without a new heartbeat counts as dead: stopped, or its

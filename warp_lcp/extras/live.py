@@ -29,7 +29,8 @@ from warp_lcp.files import Tables
 from warp_lcp.files.atomic import open_in_place
 from warp_lcp.grid.motion import Motion, Pose
 from warp_lcp.grid.signed_distance import Geometry
-from warp_lcp.render.recording import PALETTES, Recording, RenderError, VisiblePart
+from warp_lcp.render.image_content import RenderError, VisiblePart
+from warp_lcp.render.recording import PALETTES, Recording
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.run.folder import read_record
 from warp_lcp.scene.camera import viewpoint
@@ -39,7 +40,6 @@ ClientAddress = tuple[str, int]  # of TCP/IP: host and port
 Request = socket.socket | tuple[bytes, socket.socket]  # of `socketserver`; here a connection
 
 LOOPBACK = "127.0.0.1"
-PORT = 8765  # default
 # Host names accepted in requests, with any port, which may be forwarded. Others that resolve to
 # this machine are refused (DNS rebinding).
 HOST = re.compile(r"(?:127\.0\.0\.1|localhost)(?::\d{1,5})?")
@@ -323,7 +323,7 @@ class LiveServer(ThreadingHTTPServer):
         """Ignore errors of closed browsers."""
 
 
-def live_server(folder: Path, *, port: int = PORT, show: VisiblePart | None = None) -> LiveServer:
+def live_server(folder: Path, *, port: int, show: VisiblePart | None = None) -> LiveServer:
     """Return a server of a run's page, which answers once `serve_forever` runs.
 
     Raises:
@@ -338,13 +338,13 @@ def live_server(folder: Path, *, port: int = PORT, show: VisiblePart | None = No
 
 
 @contextmanager
-def served(folder: Path) -> Iterator[str]:
-    """Serve a run's page during a block, on the default port if it is free.
+def served(folder: Path, *, port: int) -> Iterator[str]:
+    """Serve a run's page during a block, on a port if it is free, else on any other.
 
     The block gets the address, or the reason why there is none.
     """
     try:
-        server = live_server(folder)
+        server = live_server(folder, port=port)
     except RenderError:
         try:
             server = live_server(folder, port=0)

@@ -16,13 +16,8 @@ from scipy.spatial.transform import Rotation
 from warp_lcp.files.atomic import make_folder, replacing_by_name
 from warp_lcp.grid.motion import Motion
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
-from warp_lcp.render.recording import (
-    WITH_PARTICLES,
-    WITH_SURFACE,
-    Recording,
-    RenderError,
-    VisiblePart,
-)
+from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE, RenderError, VisiblePart
+from warp_lcp.render.recording import Recording
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.shapes import PlaneTable

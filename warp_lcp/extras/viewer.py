@@ -13,8 +13,9 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from warp_lcp.render.image_content import RenderError
 from warp_lcp.render.page import INK
-from warp_lcp.render.recording import Recording, RenderError
+from warp_lcp.render.recording import Recording
 from warp_lcp.render.render import INSTALL, ImageStyle
 from warp_lcp.render.solid_meshes import EDGE
 from warp_lcp.run.folder import read_record

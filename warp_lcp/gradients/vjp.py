@@ -220,6 +220,10 @@ def _classified(
 ) -> tuple[DeviceArray, DeviceArray, DeviceArray, int, int]:
     """Classify the unknowns of a result as free or held.
 
+    With d the scale of a row, an unknown is held if d (x - l) <= t or d (u - x) <= t, and
+    degenerate if also |y| <= t. t is the largest entry of the residual plus
+    ROUNDING (2 d |x| + |b|).
+
     Returns y, the cell types with 0 where an unknown is held, the bound that holds it, and the
     numbers of free and of degenerate unknowns.
     """
@@ -233,7 +237,7 @@ def _classified(
         residual.diagonal,
     )
     # The result must still belong to the problem; its largest residual entry bounds the error of x.
-    tally.take(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
+    tally.launch(rows, bounds=bounds, x=x, y=y, d=d, unknown=problem.unknown, unit=residual.unit)
     square, largest = tally.read()
     norm, allowed = float(square) ** 0.5, CHANGED * result.residual
     if not norm <= allowed and not norm <= allowed + residual.rounding_floor(x, ROUNDING):

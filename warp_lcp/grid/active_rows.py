@@ -102,7 +102,11 @@ class ActiveRows:
         return replace(box, near=both)
 
     def _near(self, box: Window, particles: Particles, grow: int) -> np.ndarray:
-        """Return the marks of row segments that particles reach."""
+        """Return the marks of row segments that particles reach.
+
+        A segment has SEGMENT cells of a row. Around the segment of a particle, `grow` rows and
+        planes are marked, and ceil(grow / SEGMENT) segments along the row.
+        """
         if self._marks is None:
             self._marks = wp.zeros(math.prod(self._shape), dtype=wp.uint8, device=self.grid.device)
         self._marks.zero_()

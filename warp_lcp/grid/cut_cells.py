@@ -435,7 +435,11 @@ class CutCells:
         return float(self.grid.part.ranks.max(mine))
 
     def _refresh(self) -> None:
-        """Recompute all fields that follow from the distances."""
+        """Recompute all fields that follow from the distances at nodes [cells].
+
+        Open fractions of faces, from 0 to 1, come first, then those on open sides of the domain.
+        The states of cells follow from fractions, and the capacity from states and distances.
+        """
         grid, nodes = self.grid, self._nodes
         planes = grid.planes
         ax, ay, az = [*self.open, *self.open[1:2]][:3]  # in 2-D nothing is done to the third
@@ -479,7 +483,10 @@ class CutCells:
             continue_beyond(grid, self.open_sides, self.capacity)
 
     def _open_side(self, axis: int, name: str) -> None:
-        """Fill the fractions of the faces on an open side of the domain."""
+        """Fill the fractions of the faces on an open side of the domain.
+
+        Face i lies below cell i: the side has the index 1 at the lower end, n + 1 at the upper one.
+        """
         grid = self.grid
         face = 1 + grid.counts[axis] if SIDES.index(name) & 1 else 1
         low, high = [1, 1, 1], list(grid.counts)

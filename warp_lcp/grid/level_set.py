@@ -193,7 +193,7 @@ class LevelSet:
         assert self._volume is not None
         if grid.barriers is not None:
             grid.barriers.fill(self._box, self.phi, self._known, distance, self._beside)
-        self._volume.take(
+        self._volume.launch(
             self._box,
             phi=self.phi,
             known=self._known,

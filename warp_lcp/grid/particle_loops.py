@@ -8,7 +8,7 @@ from the fields included.
 
 import ctypes
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -209,11 +209,11 @@ def launch(
     as many particles as the list has when it runs, if one of its arrays belongs to a `ListMemory`.
     """
     rows, listed = chunks(count, grid.device), None
+    kernel_args = passed.with_members(structs, kernel_args)
     if is_recording():
-        members = [getattr(s, f.name) for s in structs for f in fields(s)]
-        memories = (list_of(a) for a in (*kernel_args.values(), *members))
+        memories = map(list_of, kernel_args.values())
         listed = next((memory for memory in memories if memory is not None), None)
     if listed is not None:
         rows = replace(rows, memory=listed.rows)
     if count or listed is not None:
-        passed.bind_arguments(rows, (grid.placement, *structs), kernel_args).launch()
+        passed.bind_arguments(rows, (grid.placement,), kernel_args).launch()

@@ -532,6 +532,10 @@ class Particles:
         self.exchange.end_sort()
 
     def _sort_cells(self) -> None:
+        """Sort all columns by the cells' numbers.
+
+        `offsets[c]` is then the number of particles in cells before c.
+        """
         grid = self.grid
         if self.count == 0:
             if self.offsets is not None:
@@ -652,7 +656,7 @@ class Particles:
         """Launch the sums over the particles, and over the threads' partial sums."""
         rows = replace(self._rows_of_totals(), memory=self._total_rows)
         if self._tally is not None:
-            self._tally.take(
+            self._tally.launch(
                 rows, self.grid.placement, position=self.position, velocity=self.velocity
             )
             return

@@ -53,11 +53,11 @@ class WindowReduction:
                 Rows.flat(columns, device, serial=True),
             )
 
-    def take(self, window: Window, *structs: DataclassInstance, **kernel_args: object) -> None:
+    def launch(self, window: Window, *structs: DataclassInstance, **kernel_args: object) -> None:
         """Launch the pass, bound as by `StencilKernel.bind`, over a window."""
         rows_of_sums = window.rows_of_sums(self._planes)
         if self._tally is not None:
-            self._tally.launch(rows_of_sums, structs, kernel_args)
+            self._tally.launch_arguments(rows_of_sums, structs, kernel_args)
             return
         kernel_args["out"] = self._partials
         self._declared.bind_arguments(rows_of_sums, structs, kernel_args).launch()
@@ -86,7 +86,7 @@ class WindowReduction:
         self._reading.changed()
 
     def changed(self) -> None:
-        """Mark the result as changed after a recorded `take` has run."""
+        """Mark the result as changed after a recorded `launch` has run."""
         if self._tally is None:
             self._reading.changed()
         else:

@@ -22,7 +22,7 @@ from warp_lcp.kernels.log_filter import start_warp
 from warp_lcp.kernels.types import DataFrame, DataType, DeviceArray, Values
 
 if TYPE_CHECKING:
-    from warp_lcp.kernels.layout import Rows
+    from warp_lcp.kernels.rows import Rows
     from warp_lcp.kernels.vectors import Communicator
 
 Array: TypeAlias = np.ndarray | DeviceArray  # on the host or on a device

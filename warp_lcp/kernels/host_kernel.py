@@ -11,8 +11,8 @@ import warp as wp
 
 from warp_lcp.kernels.kernel_variant import PLACE
 from warp_lcp.kernels.launch_graph import LaunchGraph
-from warp_lcp.kernels.layout import Rows
 from warp_lcp.kernels.recorded_arguments import Scalar, rows_memory
+from warp_lcp.kernels.rows import Rows
 from warp_lcp.kernels.stencil_kernel import StencilKernel
 from warp_lcp.kernels.types import DeviceArray
 

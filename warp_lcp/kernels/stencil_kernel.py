@@ -37,7 +37,6 @@ from warp_lcp.kernels.layout import (
     KernelStencil,
     PrecomputedProduct,
     RowLayout,
-    Rows,
     copy_of,
     native_of,
     offset_of,
@@ -51,6 +50,7 @@ from warp_lcp.kernels.recorded_arguments import (
     Scalar,
     slot_of,
 )
+from warp_lcp.kernels.rows import Rows
 from warp_lcp.kernels.thread_pool import Operation, OperationKind, Patch, ranges, team
 from warp_lcp.kernels.types import DataType, DeviceArray, FieldType, StructInstance
 
@@ -315,7 +315,7 @@ class StencilKernel:
                 "bounds"
             )
         if structs:
-            kernel_args = self._with_members(structs, kernel_args)
+            kernel_args = self.with_members(structs, kernel_args)
         if self.box:
             kernel_args |= rows.place
             constants = tuple(self.constants.values())
@@ -399,10 +399,13 @@ class StencilKernel:
             (stencil, bounds),
         )
 
-    def _with_members(
+    def with_members(
         self, structs: tuple[DataclassInstance, ...], kernel_args: dict[str, KernelArgument]
     ) -> dict[str, KernelArgument]:
-        """Return the arguments among the structs' members, and those of `kernel_args`."""
+        """Return the arguments among the structs' members, and those of `kernel_args`.
+
+        Of a name in both, the value in `kernel_args` counts.
+        """
         kinds = tuple([type(s) for s in structs])
         plan = self._members.get(kinds)
         if plan is None:
@@ -465,7 +468,7 @@ class StencilKernel:
 
     @functools.cached_property
     def _members(self) -> dict[tuple[type, ...], Plan]:
-        """Cached results of `_with_members`, by the classes of structs."""
+        """Cached results of `with_members`, by the classes of structs."""
         return {}
 
     @functools.cached_property

@@ -357,7 +357,7 @@ class DynamicReduction:
         """The results on a GPU, a number a column; None on the CPU."""
         return None if self._reading is None else self._reading.array
 
-    def take(
+    def launch(
         self,
         rows: Rows,
         *structs: DataclassInstance,
@@ -369,9 +369,9 @@ class DynamicReduction:
 
         Its results replace the former ones.
         """
-        self.launch(rows, structs, kernel_args, stencil, bounds)
+        self.launch_arguments(rows, structs, kernel_args, stencil, bounds)
 
-    def launch(
+    def launch_arguments(
         self,
         rows: Rows,
         structs: tuple[DataclassInstance, ...],
@@ -379,7 +379,7 @@ class DynamicReduction:
         stencil: KernelStencil | None = None,
         bounds: BoundOperands | None = None,
     ) -> None:
-        """Launch as `take` does, with arguments as of `StencilKernel.bind_arguments`."""
+        """Launch as `launch` does, with arguments as of `StencilKernel.bind_arguments`."""
         self._places, device = rows.places, rows.device
         if is_recording() and device.is_cuda:
             self._record(rows, structs, kernel_args, stencil, bounds)
@@ -449,7 +449,7 @@ class DynamicReduction:
                 )
 
     def changed(self) -> None:
-        """Note that a recorded `take` has run."""
+        """Mark the results as changed after a recorded `launch` has run."""
         if self._reading is not None:
             self._reading.changed()
 

@@ -235,10 +235,10 @@ class ConjugateGradient:
             bounds from below.
         """
         self.start(tolerance, max_iterations, by_error=by_error)
-        return self.found()
+        return self.read()
 
     def start(self, tolerance: float, max_iterations: int, *, by_error: bool = False) -> None:
-        """Launch the iterations; `found` then returns the result.
+        """Launch the iterations; `read` then returns the result.
 
         Arguments as of `solve`.
         """
@@ -255,7 +255,7 @@ class ConjugateGradient:
             self._program.run_while(self._going)
         self._scalars.changed()
 
-    def found(self) -> tuple[int, float]:
+    def read(self) -> tuple[int, float]:
         """Return iterations and norm after `start`; waits for the device."""
         scalars = self._scalars.numpy()
         return int(scalars[self._square + ITERATIONS - RR]), float(np.sqrt(scalars[self._square]))

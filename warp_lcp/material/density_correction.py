@@ -116,7 +116,7 @@ class DensityMonitor:
 
     def _launch(self, density: wp.array) -> None:
         b = self.boundary
-        self._crowd.take(
+        self._crowd.launch(
             self._cells, base=b.base, density=density, capacity=b.capacity, most=self.max_density
         )
 
@@ -343,7 +343,11 @@ class DensityCorrection:
         return Correction(result, over_full, most)
 
     def _launch_displacement(self, x: wp.array) -> None:
-        """Launch the computation of the displacement on all faces."""
+        """Launch the computation of the displacement on all faces.
+
+        d_i = dx (x_(i-1) - x_i) / the mean filled share, in m, with at most LONGEST cells in all
+        directions together.
+        """
         self._store_solution(x)
         longest = LONGEST / self.grid.dimension**0.5
         for axis, field in enumerate(self.displacement):
@@ -381,16 +385,22 @@ class DensityCorrection:
         part.fill(self._kind)
 
     def _prepare(self, contact: wp.array | None) -> None:
-        """Set up the problem, and count overfull cells."""
+        """Set up the problem, and count overfull cells.
+
+        A cell is overfull if its density, relative to rest, is above `max_density`. One deep inside
+        lacks material below `least` = min(max_density, 2 - max_density).
+        """
         b, most = self.boundary, self.max_density
         fields = DensityFields(self._kind, self._b, self.x, self.density, b.capacity, self._inside)
-        self._over.take(
+        self._over.launch(
             self._solved, fields, base=b.base, contact=contact, most=most, gain=self.gain
         )
         if self._inside is not None:
             self.grid.part.fill(self._inside)  # before those deep inside are told by them
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
-            self._lacking.take(self._solved, fields, least=least, planes=planes, lower=self._lower)
+            self._lacking.launch(
+                self._solved, fields, least=least, planes=planes, lower=self._lower
+            )
             if self._counted is not None:
                 launch(
                     add_kernel,

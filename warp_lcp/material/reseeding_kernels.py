@@ -7,8 +7,9 @@ from warp_lcp.grid.cell_kernel import F32, I8, I32, INTS, POINTS, U8, cell_kerne
 from warp_lcp.material.boundary_kernels import TOUCHES
 from warp_lcp.operators.grid_poisson import AIR
 
-# Fraction of half a cell: the largest random distance of a particle from the center of its part of
-# a cell, as at the start.
+# Width of the uniform random displacement from the center of a part of a cell, as a fraction of
+# the part's edge dx / 2: a particle lies up to JITTER dx / 4 from the center along each axis. It is
+# the default width of the first particles.
 JITTER = 0.25
 # Fraction of the particles that the cells around a cell can hold. A cell with less around it is
 # near a surface (a level one: 2/3), or in a bubble of more than a cell.

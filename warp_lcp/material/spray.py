@@ -25,6 +25,7 @@ AWAY = 2 * TILE
 MOST_TILES = 1 << 22  # most tiles; they are larger if there would be more
 # Cells from a solid or wall, in addition to a step's path, within which particles stay on the grid.
 CLEAR = 3
+SLOW = 10.0  # [cells/s] added to each speed: the margin of slow particles, too, grows with dt
 
 
 @list_kernel("warp_lcp.material.spray")
@@ -179,14 +180,16 @@ class Spray:
     ) -> np.ndarray:
         """Return a mask of particles that may come near a solid or closed side in a step.
 
-        It is near if its distance [m] is less than CLEAR dx + (|v| + 10 dx / s) dt, the way at its
-        speed and a margin. Particles without a finite position or velocity count as near.
+        It is near if its distance [m] is less than CLEAR dx + (|v| + SLOW dx) dt: its way in the
+        step, and a margin. The way lacks gravity's part g dt^2 and that of moving solids. The CFL
+        time step limits the two to CFL dx, usually less than CLEAR dx. Particles without a finite
+        position or velocity count as near.
         """
         x, v = (
             array.numpy() if which is None else array.numpy()[which]
             for array in (particles.position, particles.velocity)
         )
-        room = CLEAR * dx + (np.linalg.norm(v, axis=1) + 10.0 * dx) * dt
+        room = CLEAR * dx + (np.linalg.norm(v, axis=1) + SLOW * dx) * dt
         near: np.ndarray = ~np.isfinite(x + v).all(axis=1)
         for axis in range(self._dimension):
             for side, gap in enumerate((x[:, axis], self._extent[axis] - x[:, axis])):

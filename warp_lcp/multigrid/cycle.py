@@ -182,13 +182,13 @@ class GatheredLevel:
         whole: cycle of the whole problem, projected or not.
         gather: collects b.
         gather_bounds: collects the bounds.
-        take: writes this rank's part of x, ghost cells included.
+        copy_part: writes this rank's part of x, ghost cells included.
     """
 
     whole: Callable[[bool], Cycle]
     gather: Sequence[CycleStage]
     gather_bounds: Sequence[CycleStage]
-    take: CycleStage
+    copy_part: CycleStage
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterator[CycleStage]:
         """Yield the stages of a `CoarsestSolver`."""
@@ -196,4 +196,4 @@ class GatheredLevel:
         yield from self.gather
         yield from self.gather_bounds if projected else ()
         yield from self.whole(projected).stages(visits=visits)
-        yield self.take
+        yield self.copy_part

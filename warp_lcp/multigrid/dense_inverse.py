@@ -71,7 +71,7 @@ class DenseInverse:
             self._record_compact(program)
 
     def _record_compact(self, program: CommandBuffer) -> None:
-        """Record Gauss-Jordan elimination.
+        """Record Gauss-Jordan elimination of the m x m matrix of all cells, m = nz ny nx.
 
         The matrix need not be symmetric.
         """

@@ -182,7 +182,7 @@ class Hierarchy:
             whole=whole.cycles.__getitem__,
             gather=[gathering.collect_task(last.b, finest.b)],
             gather_bounds=[gathering.collect_task(mine, theirs) for mine, theirs in sides],
-            take=Launches(partial(gathering.take, finest.x, last.x)),
+            copy_part=Launches(partial(gathering.copy_part, finest.x, last.x)),
         ).solve
 
     @property

@@ -321,6 +321,8 @@ class GridPoisson(GridOperator):
     def _stored_face(self, face: Array, axis: int) -> DeviceArray:
         """Return the coefficients of lower faces as a padded array.
 
+        Face i lies between cells i - 1 and i, so an axis of n cells has n + 1 faces. The array of
+        shape (nz + 2, ny + 2, nx + 2) has the lower face of each stored cell at the cell's index.
         Empty for a number.
         """
         name = f"face_{AXES[axis]}"

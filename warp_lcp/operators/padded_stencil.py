@@ -83,7 +83,7 @@ class FieldGather(Protocol):
     def collect_task(self, mine: DeviceArray, whole: DeviceArray) -> HostTask:
         """Return the task that writes all processes' cells to the whole grid's field."""
 
-    def take(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = ...) -> None:
+    def copy_part(self, whole: DeviceArray, mine: DeviceArray, launch: Launch = ...) -> None:
         """Write this process's part of the whole grid's field to its own."""
 
 

@@ -408,7 +408,11 @@ class Stencil(GridOperator):
         )
 
     def _fill_stencil(self) -> None:
-        """Compute the diagonal, and refuse one that is not positive."""
+        """Compute the diagonal, and refuse one that is not positive.
+
+        d = center + the coefficients of closed neighbors + shift: the value beyond a closed side is
+        the cell's own.
+        """
         s = self.stencil
         self._wrap_cells()
         self._find_signs()

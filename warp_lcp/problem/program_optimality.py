@@ -232,6 +232,10 @@ def relative_residuals(program: ProgramWithRows, point: ProgramPoint) -> tuple[f
 def polished(program: ProgramWithRows, point: ProgramPoint) -> ProgramPoint:
     """Return the best point of some primal-dual active-set steps.
 
+    A step solves the optimality conditions with x = lower or x = upper where x is held, and
+    (G x - h)_j = 0 in the rows j that are held; `_newton` has the equations. The best point has the
+    smallest of the largest relative residuals.
+
     Args:
         program: with rows.
         point: near a solution.

@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 
 from warp_lcp.files.atomic import replacing_by_name
-from warp_lcp.render.recording import RenderError
+from warp_lcp.render.image_content import RenderError
 
 INSTALL_ENCODER = "pip install 'imageio-ffmpeg>=0.6'"
 SLOWEST, FASTEST = 0.1, 240.0  # frames per second of a film

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from warp_lcp.render.recording import RecordedFrame, Recording, RenderError
+from warp_lcp.render.image_content import RenderError
+from warp_lcp.render.recording import RecordedFrame, Recording
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -22,14 +22,8 @@ from warp_lcp.render.actors import (
     surface_meshes,
 )
 from warp_lcp.render.grains import grains
-from warp_lcp.render.recording import (
-    WITH_PARTICLES,
-    WITH_SURFACE,
-    Color,
-    RecordedFrame,
-    Recording,
-    VisiblePart,
-)
+from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE, Color, VisiblePart
+from warp_lcp.render.recording import RecordedFrame, Recording
 from warp_lcp.render.solid_meshes import (
     FlatSolids,
     RoomSolids,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar, cast
@@ -15,9 +14,18 @@ from warp_lcp.frames.frame_folder import FRAME_FILE
 from warp_lcp.frames.meshio_format import WRITTEN_ONLY
 from warp_lcp.frames.read_frame import READABLE, read_part
 from warp_lcp.frames.vtu import VtuMesh
+from warp_lcp.render.image_content import (
+    LABELS,
+    PARTS,
+    WITH_PARTICLES,
+    WITH_SURFACE,
+    Color,
+    RenderError,
+    VisiblePart,
+)
 from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import check_shapes, load_scene
-from warp_lcp.simulation import Cells, InputError, Points, Surface
+from warp_lcp.simulation import Cells, Points, Surface
 
 if TYPE_CHECKING:
     from matplotlib.cm import ScalarMappable
@@ -29,48 +37,6 @@ PALETTES = {  # for speeds, by `Scene.palette`
     "water": ("#0e3e8a", "#166abe", "#3aa0e0", "#82d0f0", "#cef0fa"),
     "sand": ("#a8743e", "#bd8a50", "#d2a468", "#e4be82", "#f2d8a4"),
 }
-
-
-class RenderError(InputError):
-    """An image cannot be drawn.
-
-    The message says why and what to do.
-    """
-
-
-class Color(StrEnum):
-    """Quantity of the particles' colors."""
-
-    SPEED = "speed"
-    PRESSURE = "pressure"
-    FRACTION = "fraction"
-    YIELD_RATIO = "yield_ratio"
-    PLAIN = "plain"
-
-
-class VisiblePart(StrEnum):
-    """Part of the material in images."""
-
-    PARTICLES = "particles"
-    SURFACE = "surface"
-    BOTH = "both"
-    BODIES = "bodies"  # no material
-
-
-WITH_PARTICLES, WITH_SURFACE = (
-    (VisiblePart.PARTICLES, VisiblePart.BOTH),
-    (VisiblePart.SURFACE, VisiblePart.BOTH),
-)
-
-
-# Parts that frames must have.
-PARTS = {
-    VisiblePart.PARTICLES: "particles",
-    VisiblePart.SURFACE: "surface",
-    VisiblePart.BODIES: "bodies",
-}
-# Further quantities of sand's particles.
-LABELS = {Color.FRACTION: "fraction of grains", Color.YIELD_RATIO: "yield ratio"}
 
 
 @dataclass(frozen=True)

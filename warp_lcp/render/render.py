@@ -17,8 +17,9 @@ import numpy as np
 
 from warp_lcp.files.atomic import make_folder, replacing
 from warp_lcp.render.film import Film, film_suffix
+from warp_lcp.render.image_content import Color, RenderError, VisiblePart
 from warp_lcp.render.page import Page, Painter
-from warp_lcp.render.recording import Color, Recording, RenderError, VisiblePart, spread
+from warp_lcp.render.recording import Recording, spread
 
 INSTALL = "pip install 'pyvista>=0.45'"
 INSTALL_MATPLOTLIB = "pip install 'matplotlib>=3.9'"

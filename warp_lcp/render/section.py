@@ -14,7 +14,8 @@ import warp as wp
 
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import BODY_COLORS, BODY_EDGE
-from warp_lcp.render.recording import Color, RecordedFrame, Recording, RenderError
+from warp_lcp.render.image_content import Color, RenderError
+from warp_lcp.render.recording import RecordedFrame, Recording
 from warp_lcp.render.solid_meshes import EDGE, nearest_distance, prescribed_solids
 from warp_lcp.simulation import Surface
 

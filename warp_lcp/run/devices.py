@@ -13,6 +13,10 @@ from warp_lcp.kernels.log_filter import start_warp
 from warp_lcp.run.kernel_cache import cache_error, watch_loads
 from warp_lcp.simulation import InputError
 
+# Default time that ranks wait for one of them [s]: compilation of kernels and the largest frames
+# take less.
+RANK_TIMEOUT = 600.0
+
 
 class EngineError(InputError):
     """An engine cannot be used here.

@@ -12,6 +12,7 @@ from pathlib import Path
 from warp_lcp.files.atomic import write_text
 from warp_lcp.run.trial import RunDifferences, Trial, spread_of, trial
 from warp_lcp.scene.presets import (
+    TRIAL_FRAMES,
     Preset,
     PresetName,
     SimulatorPresets,
@@ -24,8 +25,6 @@ from warp_lcp.scene.scene_file import HEADER, dump_scene
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.simulation import SimulationFailed, StepFailed
 
-# Default number of frames of a trial, as in `warp-lcp bench tradeoff`.
-FRAMES = 18
 CLOSE = 1.25  # settings within this ratio of the shortest time are timed again, interleaved
 # Ratio of times, or of distances, within the noise of the measurement; among such settings the one
 # nearer to the reference is chosen.
@@ -201,7 +200,7 @@ def tune(
     *,
     accuracy: PresetName,
     device: str,
-    frames: int = FRAMES,
+    frames: int = TRIAL_FRAMES,
     say: Callable[[str], object] = lambda text: None,
 ) -> TuningResult:
     """Find the settings with the shortest run time for an accuracy.

@@ -19,6 +19,7 @@ SceneT = TypeVar("SceneT", bound="Scene")
 PresetName = Literal["preview", "standard", "final"]
 PRESETS: tuple[PresetName, ...] = ("preview", "standard", "final")
 TABLE = "presets.toml"
+TRIAL_FRAMES = 18  # frames of the runs that measure distance and time of settings
 Settings = Mapping[str, float]  # values by "section.key", such as time.cfl
 
 

@@ -552,7 +552,7 @@ class FischerDenseWorkspace(DenseWorkspace):
         return None
 
     def _next_stage(self) -> None:
-        """Begin the next homotopy.
+        """Begin the next homotopy, at its own start with its own first mu.
 
         y is independent of x, and at least 1 at first for one-sided bounds.
         """

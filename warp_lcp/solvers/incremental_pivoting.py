@@ -263,6 +263,7 @@ class PivotingWorkspace(DenseWorkspace):
     def _finish(self) -> None:
         """Solve for x_F again; reopen rows that rounding has violated.
 
+        x_F <- clip(x_F - A_FF^-1 y_F, l_F, u_F), twice, with a new inverse of A_FF.
         At most RESTARTS times.
         """
         if len(self.inverse.members):

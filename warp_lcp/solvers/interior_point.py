@@ -516,7 +516,7 @@ class InteriorPointWorkspace(WorkspaceBase):
         )
 
     def _move(self, x: DeviceArray, second: float, tau: float, length: float) -> None:
-        """Take the step, and store mu."""
+        """Take the step, and store mu = (w's + v't) / the number of multipliers."""
         sums = self._sums.of(
             MOVE,
             self._pairs,

@@ -128,11 +128,8 @@ class MPRGP(Settings):
     def step(self, problem: LCP, work: MPRGPWorkspace, x: DeviceArray) -> Step:
         """Take a monotone cycle or a projected conjugate-gradient step.
 
-        Cycles come first, after a cold start. A proportioning step precedes the gradient step where
-        it is needed.
-
         Cycles come first, while the start is cold. A proportioning step precedes the gradient step
-        where it is needed.
+        if the chopped gradient is large: ||beta||^2 > gamma^2 phi~'phi.
         """
         if work.wants_monotone_cycle():
             return work.monotone_step(x)

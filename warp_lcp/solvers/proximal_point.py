@@ -155,7 +155,10 @@ class ProximalWorkspace(WorkspaceBase):
         )
 
     def _take_center(self, x: DeviceArray) -> None:
-        """Write the regularized problem around clip(x, l, u), and begin there."""
+        """Write the regularized problem around c = clip(x, l, u), and begin there.
+
+        Its matrix is A + eps D, its vector b - eps D c.
+        """
         inner, work = self._inner, self._work
         center = np.clip(x.numpy(), self._lower, self._upper)
         x.assign(center)

@@ -187,6 +187,7 @@ class CorrectionSystem:
     def restrict(self) -> bool:
         """Restrict the principal system to the free set; write its right-hand side.
 
+        The system is A_FF e_F = -y_F, with y = A x + b divided by `size`.
         Held unknowns are on their bounds, where `classify` has put them. Returns whether the
         right-hand side is nonzero.
         """

@@ -363,8 +363,10 @@ class DeviceIteration:
     ) -> float | None:
         """Begin a solve from a guess, and take steps.
 
-        Returns the residual at clip(0, l, u), None where the loop has to begin again. Without
-        unknowns that count, nothing is done, and the residual is 0.
+        Returns the residual |r_0| at clip(0, l, u), None where the loop has to begin again. It
+        goes on if 4 EPS |b| < |r_0| and 1e-6 |b| < |r| < 1e6 |b|, where r is the guess's residual:
+        then neither rounding nor the range of float32 corrections matters. Without unknowns that
+        count, nothing is done, and the residual is 0.
 
         Args:
             guess: stored field that is not the iterate.

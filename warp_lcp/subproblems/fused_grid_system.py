@@ -156,7 +156,8 @@ class FusedGridSystem:
     def solve(self) -> int:
         """Move x by conjugate gradients; return the number of iterations.
 
-        They end when the residual is small enough, or the free set changes.
+        They end when the residual's norm is at most max(eta |r_0|, tolerance), with |r_0| that at
+        the start, or when the free set changes.
         """
         passes, residual, s = self.iterate, self.iterate.residual, self._settings
         target, least, iterations, idle = (

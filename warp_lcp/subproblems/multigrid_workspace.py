@@ -344,6 +344,7 @@ class MultigridWorkspace(WorkspaceBase):
     def monotone_step(self) -> Step:
         """Take a projected cycle on all unknowns.
 
+        x stays in [l, u]; the coarse levels have bounds, too, see `warp_lcp.multigrid.cycle`.
         A projected sweep replaces it once cycles have raised the energy.
         """
         descent = self.energy_monitor
@@ -398,7 +399,8 @@ class MultigridWorkspace(WorkspaceBase):
     def truncated_step(self) -> Step:
         """Take a truncated step: a linear cycle on the free unknowns.
 
-        Its correction is made conjugate to the last direction, and the step is projected.
+        Its correction z is made conjugate to the last direction p, and the step is projected:
+        x <- clip(x + alpha q, l, u) with q = z + beta p.
         """
         active = self.residual.active
         self._leave()

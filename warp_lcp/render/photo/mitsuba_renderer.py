@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_lcp.files import Tables
+from warp_lcp.render.image_content import RenderError
 from warp_lcp.render.photo.photo_scene import PhotoMesh, PhotoScene, SurfaceFinish
-from warp_lcp.render.recording import RenderError
 from warp_lcp.scene.camera import Viewpoint
 
 if TYPE_CHECKING:

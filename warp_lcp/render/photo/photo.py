@@ -19,6 +19,7 @@ import numpy as np
 from warp_lcp.files import Tables
 from warp_lcp.files.atomic import make_folder, replacing
 from warp_lcp.render.film import Film, film_suffix
+from warp_lcp.render.image_content import RenderError, VisiblePart
 from warp_lcp.render.photo.mitsuba_renderer import (
     VERSION,
     Quality,
@@ -28,7 +29,7 @@ from warp_lcp.render.photo.mitsuba_renderer import (
 )
 from warp_lcp.render.photo.photo_scene import PhotoScenes
 from warp_lcp.render.photo.view_transform import agx
-from warp_lcp.render.recording import Recording, RenderError, VisiblePart
+from warp_lcp.render.recording import Recording
 
 EXPOSURE = 1.55  # factor on radiance, before AgX
 CONTRAST, SATURATION = 1.6, 1.35  # applied after AgX's sigmoid

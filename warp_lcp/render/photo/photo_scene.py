@@ -18,6 +18,7 @@ from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.render.actors import BODY_COLORS, is_round
 from warp_lcp.render.grains import placed_grains
+from warp_lcp.render.image_content import RenderError, VisiblePart
 from warp_lcp.render.photo.meshes import (
     FINE_GRAINS,
     Distance,
@@ -28,7 +29,7 @@ from warp_lcp.render.photo.meshes import (
     grain_poses,
     smooth_normals,
 )
-from warp_lcp.render.recording import Recording, RenderError, VisiblePart, spread
+from warp_lcp.render.recording import Recording, spread
 from warp_lcp.render.solid_meshes import nearest_distance, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.camera import VIEW_ANGLE, Viewpoint, view_of_points, viewpoint
