@@ -474,9 +474,7 @@ class SandScene(ParticleScene):
             for axis in closed
             for side in (("left", "right"), (), ("back", "front"))[axis]
         )
-        ends = closed and (
-            self.density_correction or self.particles.reseed or self.source or self.drain
-        )
+        ends = closed and (self.particles.reseed or self.source or self.drain)
         sweeps, bodies = method == "interleaved-sweeps", any(solid.is_body for solid in self.solid)
         holds = domain.wall != "separating" or any(
             solid.wall == "free-slip" for solid in self.solid
@@ -499,7 +497,7 @@ class SandScene(ParticleScene):
                     ends,
                     "domain.periodic",
                     periodic,
-                    "cannot be combined with density_correction, reseed, source or drain",
+                    "cannot be combined with reseed, source or drain",
                 ),
                 (
                     closed and sweeps,

@@ -677,6 +677,12 @@ class GranularSimulator:
             shown = [key for key, on in outputs.items() if scene.endless and on]
             # Surface and volume would end at sides that ranks do not have.
             refused = [f"output.{key} where an axis is periodic" for key in shown]
+            if scene.endless and scene.correction is not None:
+                # Its operator has no periodic axes on ranks.
+                refused.append(
+                    "the density correction where an axis is periodic (density_correction.every = "
+                    "0 switches it off)"
+                )
             balance = Balance(fixed=STEP_WORK)
             coverage, grid = (
                 None,
