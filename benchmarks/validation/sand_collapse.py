@@ -37,7 +37,7 @@ CASES = {20: (0.5, 1.0, 2.0, 4.0, 8.0), 40: (0.5, 1.0, 2.0, 4.0)}
 CONTROLLED = 2.0  # aspect ratio of the negative controls
 WIDENED = 0.2  # tolerance around the range of the experiments
 HEIGHT = 0.1  # tolerance of the experiments' heights
-STEEPEST = 45.0  # degrees, of a control: no cone is steeper
+STEEPEST = 50.7  # degrees, of a control: no cone is steeper
 # Cells and aspect ratios of columns whose friction grows with the rate of shear.
 GROWTH = 20, (1.0, 2.0, 4.0)
 # It grows by as much as that of glass beads.
@@ -50,7 +50,7 @@ STOPS, STAYS = 3.5, 0.5
 # Cells of height from which columns need more iterations in a step than the default limit; their
 # limit.
 HIGH, MOST = 80, 1500
-STEEP = 40.0  # degrees, of the control in 3-D, where no cone is steeper than 40.8
+STEEP = 45.0  # degrees, of the control in 3-D, where no cone is steeper than 45.5
 CUBE = 48  # cells along the domain in 3-D
 CUBE_DOMAIN, CUBE_WIDTH = 0.96, 0.28  # [m] domain in 3-D, and the cube that collapses there
 
