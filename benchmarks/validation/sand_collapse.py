@@ -71,7 +71,8 @@ DEEP, ALL = 1e-4, 1e-3  # [heights / s] drift of the inside, and of all
 class SandCollapse(NamedTuple):
     """Result of a collapse."""
 
-    runout: float  # place of the front, in widths
+    runout: float  # 99th percentile of the particles' x, beyond the column's width, in widths
+    front: float  # the same of the end of the connected deposit, at least half a cell deep
     height: float  # height of the pile, over that of Lube et al.
     moved: float  # way of the front at the end of the run, in widths
     energy: float  # kinetic energy at the end, over the largest
@@ -119,6 +120,8 @@ def runouts(
         c, label = collapse(aspect, cells), f"a = {aspect:g}"
         ways.append(c.runout)
         _compare(findings, label, c, envelope(aspect))
+        low, high = envelope(aspect)
+        findings.add(f"{label}: front of the deposit", c.front, low=low, high=high, unit="widths")
         findings.add(
             f"{label}: way of the front in the last {STAYS:g} s",
             abs(c.moved),
@@ -182,8 +185,9 @@ def collapse(
     outline = (scenes.profile(simulation)[1:-1] - scenes.FLOOR) / cells
     pile, x = outline > 0.0, (np.arange(len(outline)) + 0.5) / cells
     way, high = scenes.runout(simulation), scenes.height(simulation) / lube_height(aspect)
+    front = rows[-1]["front"] / WIDTH - 1.0
     return SandCollapse(
-        way, high, way - before, _energy(rows), share_solved(rows), (x[pile], outline[pile])
+        way, front, high, way - before, _energy(rows), share_solved(rows), (x[pile], outline[pile])
     )
 
 
