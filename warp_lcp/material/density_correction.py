@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
@@ -108,7 +109,9 @@ class DensityMonitor:
         """
         if density is None:
             density = self._density = self.grid.field() if self._density is None else self._density
-            density_of_all(self.boundary, particles, window, self.particles_a_cell, density)
+            density_of_all(
+                self.grid, self.boundary.sides, particles, window, self.particles_a_cell, density
+            )
         self._known = None
         self._cells.move_to(self._trail.through(window))
         self._measuring.run(density, variant=self._cells.near is None)
@@ -134,7 +137,8 @@ class DensityMonitor:
 
 
 def density_of_all(
-    boundary: Boundary,
+    grid: StaggeredGrid,
+    sides: PeriodicSides | None,
     particles: Particles,
     window: Window,
     particles_a_cell: int,
@@ -143,19 +147,21 @@ def density_of_all(
     """Compute the density of all processes' particles; collective.
 
     Args:
-        boundary: solids and walls, with their grid.
+        grid: the grid.
+        sides: its periodic sides; None if there are none.
         particles: as of `particle_density`, like the other arguments.
         window: likewise.
         particles_a_cell: likewise.
         density: likewise (written); also complete beside periodic sides.
     """
     particles.exchange_ghost_positions()
-    joined_density(boundary, particles, window, particles_a_cell, density)
+    joined_density(grid, sides, particles, window, particles_a_cell, density)
     particles.drop_ghosts()
 
 
 def joined_density(
-    boundary: Boundary,
+    grid: StaggeredGrid,
+    sides: PeriodicSides | None,
     particles: Particles,
     window: Window,
     particles_a_cell: int,
@@ -166,10 +172,10 @@ def joined_density(
     Beside a periodic side a kernel reaches beyond the domain. What it adds to the ring there
     belongs to the cells at the opposite side. Arguments as of `density_of_all`.
     """
-    particle_density(boundary.grid, particles, window, particles_a_cell, density)
-    if boundary.sides is not None:
-        boundary.sides.add(density)
-    boundary.grid.part.fill(density)
+    particle_density(grid, particles, window, particles_a_cell, density)
+    if sides is not None:
+        sides.add(density)
+    grid.part.fill(density)
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,7 +401,9 @@ class DensityCorrection:
         self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None
     ) -> None:
         """Launch the density and the set-up of the problem."""
-        joined_density(self.boundary, particles, window, self.particles_a_cell, self.density)
+        joined_density(
+            self.grid, self.boundary.sides, particles, window, self.particles_a_cell, self.density
+        )
         if fill is not None:
             fill(window, self.density)
         self._prepare(contact)
