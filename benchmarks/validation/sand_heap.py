@@ -228,6 +228,6 @@ CHECK = ValidationCheck(
     trials=[(heaps, RESOLUTIONS), (wedges, RESOLUTIONS)],
     across=("both", alike),
     charts=[plot("sand-heaps", "Heaps and wedges", "x [m]", "y [m]")],
-    known="sand at rest holds up to asin k, 39.6 degrees for an angle of repose of 35: such heaps lie "
-    "at 38 to 39",
+    known="sand at rest holds up to asin k, 39.6 degrees for an angle of repose of 35: such heaps "
+    "lie at 38 to 39",
 )
