@@ -14,7 +14,7 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-FrictionAngleTest = Literal["repose", "plane-strain", "triaxial-compression"]
+FrictionAngleTest = Literal["repose", "simple-shear", "plane-strain", "triaxial-compression"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +22,7 @@ class Material:
     """Granular material.
 
     Attributes:
-        friction_angle: angle of a slope at which the material stops [degrees].
+        friction_angle: angle of repose, that of a heap [degrees].
         density: bulk density at the densest packing, with air [kg/m^3].
         max_fraction: volume fraction of grains at the densest packing.
         wall_friction: Coulomb's coefficient against solids.
@@ -46,23 +46,31 @@ def slope(angle: float, test: FrictionAngleTest, dimension: int) -> float:
 
     The angle [degrees] is that of the given test.
 
-    Repose: layers stop at this angle, k = tan. Material that slides along a slope is in simple
-    shear, under equal normal stresses: its shear stress over its pressure is the slope's tangent.
-    Sand at rest that was compressed along the slope stays up to asin(k), 35.3 degrees for k =
-    tan(30 degrees): heaps that are poured slowly lie between both.
+    Simple shear: layers stop at this angle, k = tan. Material that slides along a slope is in
+    simple shear, under equal normal stresses: its shear stress over its pressure is the slope's
+    tangent. Sand at rest that was compressed along the slope stays up to asin(k), 35.3 degrees for
+    k = tan(30 degrees).
+
+    Repose: the angle of a heap that is poured slowly. It lies between both, atan(k) and asin(k), so
+    that neither k = tan nor k = sin gives it. Their mean is taken, k = (sin + tan) / 2: for 30
+    degrees layers stop at 28.3, and sand at rest stays up to 32.6.
 
     Plane strain: the criterion of Mohr and Coulomb, k = sin. In 3-D its cone has a smaller angle
     under compression along one axis: 30 degrees become 22.2. So triaxial compression has k = 2
     sqrt(3) sin / (3 - sin), from |s|_F = sqrt(2/3) q and q = 6 sin / (3 - sin) p, where q is the
     difference of the principal stresses. In 2-D the only compression is plane strain.
 
-    >>> alike = (26.565, "repose"), (30.0, "plane-strain"), (22.23, "triaxial-compression")
-    >>> print(*(f"{slope(angle, test, 3):.3f}" for angle, test in alike))
+    >>> alike = ("repose", 27.97), ("simple-shear", 26.57), ("plane-strain", 30.0)
+    >>> print(*(f"{slope(angle, test, 3):.3f}" for test, angle in alike))
     0.500 0.500 0.500
+    >>> print(f"{slope(22.23, 'triaxial-compression', 3):.3f}")
+    0.500
     """
+    sine, tangent = math.sin(math.radians(angle)), math.tan(math.radians(angle))
+    if test == "simple-shear":
+        return tangent
     if test == "repose":
-        return math.tan(math.radians(angle))
-    sine = math.sin(math.radians(angle))
+        return 0.5 * (sine + tangent)
     return (
         2.0 * math.sqrt(3.0) * sine / (3.0 - sine)
         if test == "triaxial-compression" and dimension == 3

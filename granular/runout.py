@@ -1,7 +1,7 @@
 # mypy: ignore-errors
-"""Runout and height of sand: percentiles of the particles' x and y.
+"""Front of the deposit; runout and height of sand as percentiles of the particles' x and y.
 
-They are selected on the device, without an extra readback.
+All are computed on the device, without an extra readback.
 
 The n-th smallest of float32 numbers is found digit by digit (radix selection). For each digit, the
 numbers that begin with the digits found so far are counted by their next digit; the digit in whose
@@ -10,15 +10,18 @@ count the n-th number falls is the next one. Counts are integers, so that the re
 
 from typing import no_type_check
 
+import numpy as np
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import INTS, POINTS, launch_list, list_kernel
+from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, launch_list, list_kernel
 from warp_lcp.grid.particles import Particles
+from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import LaunchGraph, launch
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, launch
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.recorded_arguments import Scalar
 
+LEAST_DEPTH = 0.5  # cells of densely packed sand, from which a column is part of the deposit
 AXES, DIGITS, BITS = 2, 256, 8
 SIGN = wp.constant(wp.uint32(1 << 31))
 WORDS = wp.array(dtype=wp.uint32)
@@ -79,6 +82,91 @@ def select_kernel(
     selected[axis] = bits
     rank[axis] = left
     out[axis] = wp.cast(wp.where(bits < SIGN, ~bits, bits ^ SIGN), wp.float32)
+
+
+def deposit_front(depth: np.ndarray) -> float:
+    """Return how far the connected deposit reaches along x [cells].
+
+    The deposit is the columns around the deepest one that hold at least `LEAST_DEPTH`. Its front is
+    where the depth, linear between the centers of columns, falls to that. Grains that have run
+    ahead do not count, nor does sand beyond a gap.
+
+    Args:
+        depth: densely packed sand of each column along x [cells], shape (n,).
+
+    >>> deposit_front(np.array([1.5, 1.0, 0.5, 0.0, 0.1, 1.2]))
+    2.5
+    """
+    if not len(depth) or depth.max() < LEAST_DEPTH:
+        return 0.0
+    last = int(depth.argmax())
+    while last + 1 < len(depth) and depth[last + 1] >= LEAST_DEPTH:
+        last += 1
+    if last + 1 == len(depth):
+        return float(len(depth))
+    return last + 0.5 + float((depth[last] - LEAST_DEPTH) / (depth[last] - depth[last + 1]))
+
+
+@forward_kernel(module="granular.runout")
+def depth_kernel(fraction: F32, rows: int, depth: wp.array(dtype=wp.float32)):
+    """Compute the largest depth of sand at an x, over z [cells].
+
+    With one thread per column; `rows` are the cells along y.
+    """
+    k, i = wp.tid()
+    total = float(0.0)
+    for j in range(rows):
+        total += fraction[k + 1, j + 1, i + 1]
+    wp.atomic_max(depth, i, total)
+
+
+@forward_kernel(module="granular.runout")
+def front_kernel(depth: wp.array(dtype=wp.float32), least: float, out: wp.array(dtype=wp.float32)):
+    """Compute the front as `deposit_front` does [cells]; with one thread."""
+    count = depth.shape[0]
+    last = int(0)
+    for i in range(count):
+        if depth[i] > depth[last]:
+            last = i
+    front = float(0.0)
+    if depth[last] >= least:
+        while last + 1 < count and depth[wp.min(last + 1, count - 1)] >= least:
+            last += 1
+        front = float(count)
+        if last + 1 < count:
+            front = float(last) + 0.5 + (depth[last] - least) / (depth[last] - depth[last + 1])
+    out[0] = front
+
+
+class DepositFront:
+    """Front of the deposit on a grid, see `deposit_front`.
+
+    Args:
+        grid: the grid.
+    """
+
+    def __init__(self, grid: StaggeredGrid) -> None:
+        self._grid = grid
+        self._depth = wp.zeros(grid.counts[0], dtype=wp.float32, device=grid.device)
+        self._reading = DeviceScalar(grid.device, 1, wp.float32)
+        self._search = LaunchGraph(grid.device, self._launch)
+
+    def find(self, fraction: wp.array) -> None:
+        """Launch the search in a field of cell fractions; `read` then returns the result."""
+        self._search.run(fraction)
+        self._reading.changed()
+
+    def _launch(self, fraction: wp.array) -> None:
+        (nx, ny, nz), device = self._grid.counts, self._grid.device
+        clear(self._depth)
+        launch(depth_kernel, (nz, nx), [fraction, ny, self._depth], device=device)
+        inputs = [self._depth, LEAST_DEPTH, self._reading.array]
+        launch(front_kernel, 1, inputs, device=device)
+
+    def read(self) -> float:
+        """Return x of the front [m]; waits for the device."""
+        cells = float(self._reading.numpy()[0])
+        return self._grid.spacing * (self._grid.origin[0] + cells) if cells > 0.0 else 0.0
 
 
 class ParticlePercentiles:

@@ -28,7 +28,11 @@ STRESS_BYTES = {2: 160, 3: 330}  # bytes per cell: the coupled solve's fields
 CUT_STRESS_BYTES = {2: 48, 3: 76}  # added where solids cut cells
 # Slope k from which on the yield cone contains tensile stresses.
 STEEPEST = {2: 1.0, 3: math.sqrt(0.75)}
-STEEPEST_ANGLE = {"repose": {2: 45.0, 3: 40.8}, "triaxial-compression": {3: 36.8}}  # degrees
+STEEPEST_ANGLE = {  # degrees
+    "repose": {2: 50.7, 3: 45.5},
+    "simple-shear": {2: 45.0, 3: 40.8},
+    "triaxial-compression": {3: 36.8},
+}
 FRICTION_ANGLE = UsualRange(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
 COHESION = UsualRange(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
 SAND_CFL = UsualRange(0.0, 4.0, "", "0.5 to 1")
@@ -78,8 +82,8 @@ class MaterialTable(Table):
     )
     friction_angle: Angle | None = Field(
         default=None,
-        description="slope at which running sand stops [degrees], see friction_angle_test; "
-        "default: by name",
+        description="friction angle [degrees], by default the slope of a heap, see "
+        "friction_angle_test; default: by name",
     )
     density: Positive | None = Field(
         default=None,
@@ -95,16 +99,17 @@ class MaterialTable(Table):
     )
     cohesion: NonNegative = Field(
         default=0.0,
-        description="cohesion [Pa]: shear strength at zero pressure; with other tests than repose, "
-        "divided by cos(friction_angle)",
+        description="cohesion [Pa]: the shear strength at zero pressure is this times k / "
+        "tan(friction_angle), see friction_angle_test",
     )
     tensile_strength: NonNegative = Field(
         default=0.0, description="tensile strength at dense packing [Pa]"
     )
-    friction_angle_test: FrictionAngleTest = Field(
-        default="repose",
-        description="test that measured friction_angle: repose (slope where layers stop), "
-        "plane-strain or triaxial-compression (soils)",
+    friction_angle_test: FrictionAngleTest | None = Field(
+        default=None,
+        description="test that measured friction_angle: repose (slope of a heap), simple-shear "
+        "(slope where layers stop), plane-strain or triaxial-compression (soils); default: repose, "
+        "simple-shear with friction.dynamic_angle",
     )
 
 
@@ -276,8 +281,17 @@ class SandScene(ParticleScene):
         """Return k of the yield set |s|_F / sqrt(2) <= k p."""
         return self._slope_of(self.friction_angle)
 
+    @property
+    def friction_angle_test(self) -> FrictionAngleTest:
+        """Return the test that measured the friction angles.
+
+        mu(I) is measured on layers, so the angles of rate-dependent friction are theirs by default.
+        """
+        grows = self.friction.dynamic_angle is not None
+        return self.material.friction_angle_test or ("simple-shear" if grows else "repose")
+
     def _slope_of(self, angle: float) -> float:
-        return slope(angle, self.material.friction_angle_test, self.dimension)
+        return slope(angle, self.friction_angle_test, self.dimension)
 
     @property
     def intercept(self) -> float:
@@ -414,10 +428,8 @@ class SandScene(ParticleScene):
 
     def _at_most(self) -> str:
         """Return the allowed range of an angle that is too steep, in words."""
-        test, most = (
-            self.material.friction_angle_test,
-            STEEPEST_ANGLE[self.material.friction_angle_test][self.dimension],
-        )
+        test = self.friction_angle_test
+        most = STEEPEST_ANGLE[test][self.dimension]
         return (
             f'must be at most {most:g} where material.friction_angle_test = "{test}": a steeper '
             "cone would bear tension"
@@ -474,9 +486,7 @@ class SandScene(ParticleScene):
             for axis in closed
             for side in (("left", "right"), (), ("back", "front"))[axis]
         )
-        ends = closed and (
-            self.density_correction or self.particles.reseed or self.source or self.drain
-        )
+        ends = closed and (self.particles.reseed or self.source or self.drain)
         sweeps, bodies = method == "interleaved-sweeps", any(solid.is_body for solid in self.solid)
         holds = domain.wall != "separating" or any(
             solid.wall == "free-slip" for solid in self.solid
@@ -499,7 +509,7 @@ class SandScene(ParticleScene):
                     ends,
                     "domain.periodic",
                     periodic,
-                    "cannot be combined with density_correction, reseed, source or drain",
+                    "cannot be combined with reseed, source or drain",
                 ),
                 (
                     closed and sweeps,

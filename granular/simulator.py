@@ -15,7 +15,7 @@ import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
-from warp_lcp.granular.runout import ParticlePercentiles
+from warp_lcp.granular.runout import DepositFront, ParticlePercentiles, deposit_front
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import METHODS, StressWorkspace
@@ -66,7 +66,7 @@ JAMMED = (
     "solver.max_iterations"
 )
 STANDING = 0.05  # of sqrt(g dx): velocity scale of the residual without gravity
-DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess")  # columns for the log only
+DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess", "front")  # columns for the log only
 COLUMNS = (
     "coupled_residual",
     "staggering_iterations",
@@ -141,6 +141,7 @@ class SandSimulation(ParticleSimulation):
             self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried
         )
         self.outcome = SandReport(self.stress)
+        self._deposit = None if grid.part.shared else DepositFront(grid)
         self._work: StressWorkspace | None = None  # of the current method
         self._made_by: Solver | None = None
         inner = (slice(1, -1),) * 3
@@ -250,12 +251,15 @@ class SandSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
                 self.outcome.measure()
+                if self._deposit is not None:
+                    self._deposit.find(self.packing.fraction)
 
     def _measured(self) -> Row:
         """Return stress values that only the log needs."""
         if not self.scene.output.diagnostics:
             return {}
-        return self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
+        report = self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
+        return report | {"front": self._deposit_front()}
 
     def _measure_front(self) -> None:
         """Launch the percentiles of runout and height, on CUDA."""
@@ -268,10 +272,11 @@ class SandSimulation(ParticleSimulation):
         coupled_residual: natural residual of pressure and friction together, root mean square over
         the cells with sand, in units of rho g dx; solve_residual: relative to that at the start of
         the solve; staggering_iterations: iterations of the coupled method; yielded, dissipation,
-        predicted_excess: see `SandReport.report`; max_fraction: largest fraction of a cell at the
-        start of the step, relative to the densest packing; runout [m]: 99th percentile of x less
-        that at the start; height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]: mass
-        below the gauge, or without a gauge the mass that left through drains and open sides.
+        predicted_excess: see `SandReport.report`; front [m]: x up to which the deposit is connected
+        at the start of the step, see `deposit_front`; max_fraction: largest fraction of a cell at
+        the start of the step, relative to the densest packing; runout [m]: 99th percentile of x
+        less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]:
+        mass below the gauge, or without a gauge the mass that left through drains and open sides.
         """
         columns = tuple(
             name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS
@@ -575,6 +580,21 @@ class SandSimulation(ParticleSimulation):
             np.partition(position[:, 1], nth)[nth]
         )
 
+    def _deposit_front(self) -> float:
+        """Return x of the deposit's front [m]; collective.
+
+        In 3-D the depth at an x is that of the deepest column there.
+        """
+        if self._deposit is not None:
+            return self._deposit.read()
+        part, counts = self.grid.part, self.grid.domain_counts
+        owned = part.box_of(self.packing.fraction.numpy())
+        depth = np.zeros((counts[2], counts[0]))
+        i, _, k = part.first
+        nz, _, nx = owned.shape
+        depth[k : k + nz, i : i + nx] = owned.sum(axis=1, dtype=np.float64)
+        return self.grid.spacing * deposit_front(part.ranks.sum(depth).max(axis=0))
+
     def _front_of_all(self) -> tuple[float, float]:
         """Return the percentiles of all ranks' particles.
 
@@ -677,6 +697,12 @@ class GranularSimulator:
             shown = [key for key, on in outputs.items() if scene.endless and on]
             # Surface and volume would end at sides that ranks do not have.
             refused = [f"output.{key} where an axis is periodic" for key in shown]
+            if scene.endless and scene.correction is not None:
+                # Its operator has no periodic axes on ranks.
+                refused.append(
+                    "the density correction where an axis is periodic (density_correction.every = "
+                    "0 switches it off)"
+                )
             balance = Balance(fixed=STEP_WORK)
             coverage, grid = (
                 None,

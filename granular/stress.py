@@ -57,7 +57,7 @@ class YieldSet:
     [Jop, Forterre & Pouliquen 2006].
 
     Attributes:
-        k: slope of the cone, the tangent of the angle of repose; see `granular.materials.slope`.
+        k: slope of the cone, see `granular.materials.slope`.
         cohesion: cohesion of cells that have shear stress.
         tension: tensile strength of cells that are nearly full.
         gain: largest increase of k; used only if the stresses were created with `rate`.

@@ -282,7 +282,7 @@ def _sand(draw: SceneDraw, data: Tables, material: list[Tables]) -> None:
     data["gauge"] = {"height": 0.2 * draw.side}
     data["solver"] = {"max_iterations": 200, "method": "accelerated-projection"}
     if draw.turn // 2 % 4 == 3:
-        for key in ("source", "drain", "density_correction"):
+        for key in ("source", "drain"):
             del data[key]
         del data["particles"]["reseed"]
         data["domain"] |= {"open": [], "periodic": [True, False, False][: draw.dimension]}

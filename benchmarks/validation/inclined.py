@@ -64,7 +64,8 @@ SETS_IN, OFF = 0.9, 0.8  # [s] until the flow is steady; initial factor of the p
 # Slopes [degrees], and friction of the planes on which the block slides.
 PLANES = ((10.0, 0.1), (20.0, 0.2), (30.0, 0.3), (45.0, 0.5))
 BLOCK_HEIGHT, BLOCK_LENGTH = 0.1, 0.4  # [m]
-BLOCK = {"friction_angle": 40.0, "cohesion": 5e3}
+SHEARED = {"friction_angle_test": "simple-shear"}  # angles are those of layers
+BLOCK = {"friction_angle": 40.0, "cohesion": 5e3} | SHEARED
 AFTER, UNTIL = 0.03, 0.12  # [s] range in which the block's acceleration is measured
 HOPPER = 40  # cells of the hopper's width
 # Sizes of the hopper [m, degrees], and its friction.
@@ -102,13 +103,14 @@ def slab(findings: Findings, cells: int, angles: tuple[float, ...] = SLIDES) -> 
 
     The control is a floor without friction.
     """
-    tables = {"material": {"friction_angle": STIFF}, "floor": SMOOTH}
+    stiff = {"friction_angle": STIFF} | SHEARED
+    tables = {"material": stiff, "floor": SMOOTH}
     _, late = rests(cells, SLAB_REST, **tables)
     findings.add(f"{SLAB_REST:g} degrees: |mean acceleration|", abs(late), high=0.01, unit="g")
     for angle in angles:
         ratio = runs(cells, angle, speed=0.0, **tables) / accelerates(angle)
         findings.add(f"{angle:g} degrees: acceleration over expected", ratio, low=0.94, high=1.06)
-    _, slips = rests(cells, SLAB_REST, material={"friction_angle": STIFF}, floor=0.0)
+    _, slips = rests(cells, SLAB_REST, material=stiff, floor=0.0)
     findings.must_break("smooth floor: mean acceleration", slips, high=0.01, unit="g")
 
 
@@ -118,7 +120,7 @@ def bagnold(findings: Findings, cells: int, angles: tuple[float, ...] = STEADY) 
 
     The control is constant friction.
     """
-    beads: Tables = {"material": {"friction_angle": STATIC}}
+    beads: Tables = {"material": {"friction_angle": STATIC} | SHEARED}
     growing = beads | {
         "friction": {"dynamic_angle": DYNAMIC, "grain_size": GRAIN, "inertial_number": INERTIAL}
     }
@@ -225,7 +227,7 @@ def _create(
             "friction": floor,
         },
         "physics": tilted(angle),
-        "material": {"friction_angle": FRICTION_ANGLE},
+        "material": {"friction_angle": FRICTION_ANGLE} | SHEARED,
         "particles": {"jitter": 0.0},
     }
     return create_sand(

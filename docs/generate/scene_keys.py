@@ -140,8 +140,8 @@ LIMITS = """## Limits
 - A scene has one kind of sand, and its walls are `separating`. Liquids may differ in viscosity, not
   in density.
 - `narrow_band` and `output.forces` are for liquids only.
-- Periodic axes are for sand without rigid bodies, sources, drains, reseeding or
-  `[density_correction]`.
+- Periodic axes are for sand without rigid bodies, sources, drains and reseeding; on ranks also
+  without density correction (`density_correction.every = 0`).
 - A solid is moved by `motion` or is a rigid body, not both. Neither works with `solids = "voxel"`.
 """
 

@@ -120,12 +120,13 @@ TRICKLING = {
     "drain": [box([0.4, 0.0], [0.6, 0.1], start=0.01)],
     "material": {"cohesion": 50.0},
 }
-SLOPE = {
+UNCORRECTED = {"density_correction": {"every": 0}}
+SLOPE = UNCORRECTED | {
     "physics": {"gravity": [4.0, -8.0]},
     "periodic": [True, False],
     "sand": [box([0.6, 0.0], [1.0, 0.3], velocity=[1.0, 0.0])],
 }
-ROUND = {  # along x and z, over a periodic step, around a wheel
+ROUND = UNCORRECTED | {  # along x and z, over a periodic step, around a wheel
     "periodic": [True, False, True],
     "sand": [box([0.0, 0.0, 0.0], [1.0, 0.2, 0.5], velocity=[-0.8, 0.0, 0.6])],
     "solid": [box([-1.0, -1.0, -1.0], [2.0, 0.05, 2.0]), THICK_BLADE],
@@ -338,7 +339,9 @@ BARE = {  # every stage of a step, with an empty rank
     | {"solid": [AWAY | {"density": 500.0}], "particles": {"reseed": {"min": 4, "max": 4}}},
     "voxel pile": PILE
     | {"solid": [AWAY], "solids": "voxel", "source": [LATE], "friction": {"model": "box"}},
-    "endless pile": PILE | {"periodic": [True, False], "sand": [box([0.15, 0.0], [0.35, 0.2])]},
+    "endless pile": PILE
+    | UNCORRECTED
+    | {"periodic": [True, False], "sand": [box([0.15, 0.0], [0.35, 0.2])]},
     "no pile": PILE
     | {
         "drain": [box([0.0, 0.0], [1.0, 0.5], start=0.02)],

@@ -271,7 +271,7 @@ def test_a_floor_goes_on_across_the_sides() -> None:
         ({"domain": {"periodic": [True, True]}}, "along x and z only"),
         ({"domain": {"open": ["left"]}}, "side of a periodic axis"),
         ({"solver": {"method": "interleaved-sweeps"}}, "cannot be combined with periodic axes"),
-        ({"density_correction": {}}, "cannot be combined with density_correction"),
+        ({"particles": {"reseed": {}}}, "cannot be combined with reseed, source or drain"),
     ],
 )
 def test_contradicting_settings_are_refused(tables: dict[str, Any], message: str) -> None:

@@ -131,7 +131,7 @@ def test_both_methods_find_the_same_velocity() -> None:
         (
             GROWS | {"dynamic_angle": 50.0},
             "friction.dynamic_angle = 50.0: must be at most 45 where material.friction_angle_test "
-            '= "repose"',
+            '= "simple-shear"',
         ),
         (
             GROWS | {"model": "box"},

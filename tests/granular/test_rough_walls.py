@@ -22,7 +22,7 @@ def pushed(
         [-1.0, -1.0], [2.0, 2 * DX], motion={"kind": "translation", "velocity": [0.0, SPEED]}
     )
     sand = [box([0.0, 2 * DX], [6 * DX, (depth + 2) * DX])]
-    material = {"friction_angle": 40.0, "cohesion": cohesion}
+    material = {"friction_angle": 40.0, "friction_angle_test": "simple-shear", "cohesion": cohesion}
     size = [6 * DX, (depth + 8) * DX]
     simulation = create(
         scene(

@@ -1,4 +1,4 @@
-"""Percentiles selected on a device, against NumPy's partition."""
+"""Front of the deposit; percentiles selected on a device, against NumPy's partition."""
 
 from typing import Any
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.granular.runout import ParticlePercentiles
+from warp_lcp.granular.runout import DepositFront, ParticlePercentiles, deposit_front
 from warp_lcp.granular.simulator import percentile_place
+from warp_lcp.grid.staggered import StaggeredGrid
 
 DEVICE = wp.get_device("cpu")
 
@@ -46,3 +47,33 @@ def test_no_particles_are_nowhere() -> None:
     front = ParticlePercentiles(DEVICE)
     front.find(particles(np.zeros((0, 3))), percentile_place(0))
     assert front.read() == (0.0, 0.0)
+
+
+def test_the_front_is_where_a_wedge_is_half_a_cell_deep() -> None:
+    """Front of a wedge, wherever its toe lies in the grid; grains ahead of it do not count."""
+    x = np.arange(40) + 0.5
+    for toe in (20.0, 20.3, 20.8):
+        depth = np.maximum(0.4 * (toe - x), 0.0)
+        depth[30] = 0.3
+        assert deposit_front(depth) == pytest.approx(toe - 1.25, abs=1e-12)
+        depth[32] = 5.0  # a pile of its own
+        assert deposit_front(depth) == pytest.approx(toe - 1.25, abs=1e-12)
+
+
+def test_the_front_of_no_deposit_and_of_one_up_to_the_wall() -> None:
+    assert deposit_front(np.zeros(0)) == deposit_front(np.full(5, 0.4)) == 0.0
+    assert deposit_front(np.full(5, 2.0)) == 5.0
+
+
+@pytest.mark.parametrize("counts", [(30, 12, 1), (24, 9, 5)])
+def test_the_front_on_a_device_is_that_of_the_deepest_columns(counts: tuple[int, int, int]) -> None:
+    rng, grid = np.random.default_rng(31), StaggeredGrid(counts, 0.5, 3 if counts[2] > 1 else 2)
+    front = DepositFront(grid)
+    for filled in (0.0, 0.02, 0.1, 0.2, 0.5, 1.0):
+        fraction = np.zeros(grid.shape, dtype=np.float32)
+        inside = rng.random(counts[::-1]) * (rng.random(counts[::-1]) < filled)
+        inside *= np.linspace(1.5, 0.0, counts[0]) ** 2
+        fraction[1:-1, 1:-1, 1:-1] = inside
+        front.find(wp.array(fraction, dtype=wp.float32, device=DEVICE))
+        expected = 0.5 * deposit_front(inside.sum(axis=1).max(axis=0))
+        assert front.read() == pytest.approx(expected, rel=1e-5)

@@ -34,6 +34,7 @@ def test_the_log_has_the_columns_of_sand(folder: Path) -> None:
         "yielded",
         "dissipation",
         "predicted_excess",
+        "front",
         "max_fraction",
         "runout",
         "height",
@@ -41,6 +42,7 @@ def test_the_log_has_the_columns_of_sand(folder: Path) -> None:
         assert all(np.isfinite(float(row[name])) for row in rows)
     assert {row["solver"] for row in rows} == {"accelerated-projection"}
     assert float(rows[-1]["runout"]) > float(rows[0]["runout"])
+    assert float(rows[-1]["front"]) > float(rows[0]["front"])
     assert float(rows[-1]["height"]) < float(rows[0]["height"])
     assert {"density_status", "max_density"} <= rows[0].keys()
     assert "flow_rate" not in rows[0]

@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from small_sands import box, scene
-from warp_lcp.granular.scene import STICKS, SandScene
+from warp_lcp.granular.materials import slope
+from warp_lcp.granular.scene import STEEPEST_ANGLE, STICKS, SandScene
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError, validate
 
@@ -51,8 +52,8 @@ def error(tmp_path: Any, *overrides: str) -> str:
         ("material.tensile_strength=100", "material.tensile_strength = 100.0: must be at most 0"),
         (
             "material.friction_angle_test=shear",
-            "material.friction_angle_test = \"shear\": must be 'repose', 'plane-strain' or "
-            "'triaxial-compression'",
+            "material.friction_angle_test = \"shear\": must be 'repose', 'simple-shear', "
+            "'plane-strain' or 'triaxial-compression'",
         ),
         (
             "material.wall_friction=-0.1",
@@ -108,8 +109,8 @@ def test_invalid_settings_are_refused(tmp_path: Any, overrides: str, expected: s
             "names a side of a periodic axis",
         ),
         (
-            ["domain.periodic=[true, false]", "density_correction.every=1"],
-            "cannot be combined with density_correction",
+            ["domain.periodic=[true, false]", "particles.reseed.every=1"],
+            "cannot be combined with reseed, source or drain",
         ),
         (
             ["material.cohesion=10", "material.tensile_strength=20"],
@@ -179,15 +180,24 @@ def test_walls_and_solids_have_their_own_friction() -> None:
 def test_the_slope_of_the_yield_set() -> None:
     """Slope of the yield set.
 
-    k is tan 30 of repose and sin 30 in plane strain. In triaxial compression it is 2 sqrt(3) sin /
-    (3 - sin), the outer cone. 2-D is plane strain. Cohesion counts as such in the first, times cos
-    30 in the others.
+    k is tan 30 in simple shear, sin 30 in plane strain, and the mean of both of repose. In triaxial
+    compression it is 2 sqrt(3) sin / (3 - sin), the outer cone. 2-D is plane strain. Cohesion
+    counts k / tan 30 of it: as such in the first, times cos 30 in the second.
     """
     sand = [box([0.0, 0.0], [0.2, 0.2])]
+    tangent, cosine = math.tan(math.radians(30.0)), math.sqrt(0.75)
     assert scene(size=[1.0, 0.5], resolution=16, sand=sand).slope == pytest.approx(
-        math.tan(math.radians(30.0))
+        0.5 * (0.5 + tangent)
     )
-    for test, factor in (("repose", 1.0), ("plane-strain", math.sqrt(0.75))):
+    sheared = {"material": {"friction_angle_test": "simple-shear"}}
+    assert scene(size=[1.0, 0.5], resolution=16, sand=sand, **sheared).slope == pytest.approx(
+        tangent
+    )
+    for test, factor in (
+        ("repose", 0.5 * (1.0 + cosine)),
+        ("simple-shear", 1.0),
+        ("plane-strain", cosine),
+    ):
         material = {"friction_angle_test": test, "cohesion": 10.0}
         assert scene(
             size=[1.0, 0.5], resolution=16, sand=sand, material=material
@@ -211,9 +221,9 @@ def test_a_cone_that_would_bear_tension_is_refused() -> None:
     """
     flat = [box([0.0, 0.0], [0.2, 0.2])]
     with pytest.raises(
-        ValueError, match=r"must be at most 45 where material.friction_angle_test = \"repose\""
+        ValueError, match=r"must be at most 50\.7 where material.friction_angle_test = \"repose\""
     ):
-        scene(size=[1.0, 0.5], resolution=16, sand=flat, material={"friction_angle": 46.0})
+        scene(size=[1.0, 0.5], resolution=16, sand=flat, material={"friction_angle": 51.0})
     sand = [box([0.0] * 3, [0.2] * 3)]
     steep = {"material": {"friction_angle_test": "triaxial-compression", "friction_angle": 37.0}}
     with pytest.raises(ValueError, match=r"must be at most 36\.8"):
@@ -233,3 +243,36 @@ def test_the_plan_lists_material_and_friction() -> None:
     assert plan["material"].startswith("dry-sand, friction angle 30 degrees")
     assert plan["friction"] == "cone, on walls 0.577"
     assert plan["solver"].startswith("accelerated-projection to 0.001")
+
+
+@pytest.mark.parametrize(
+    ("dimension", "test", "steepest"),
+    [
+        (2, "repose", 1.0),
+        (2, "simple-shear", 1.0),
+        (3, "repose", math.sqrt(0.75)),
+        (3, "simple-shear", math.sqrt(0.75)),
+    ],
+)
+def test_the_steepest_angles_are_those_of_the_cone(
+    dimension: int, test: Any, steepest: float
+) -> None:
+    """Angles to a tenth of a degree at which the cone begins to bear tension."""
+    angle = STEEPEST_ANGLE[test][dimension]
+    assert slope(angle, test, dimension) <= steepest < slope(angle + 0.1, test, dimension)
+
+
+def test_angles_of_friction_that_grows_are_those_of_layers() -> None:
+    sand, tangent = [box([0.0, 0.0], [0.2, 0.2])], math.tan(math.radians(30.0))
+    grows = {"dynamic_angle": 35.0, "grain_size": 1e-3}
+    model = scene(size=[1.0, 0.5], resolution=16, sand=sand, friction=grows)
+    assert model.friction_angle_test == "simple-shear"
+    assert model.slope == pytest.approx(tangent)
+    asked = scene(
+        size=[1.0, 0.5],
+        resolution=16,
+        sand=sand,
+        friction=grows,
+        material={"friction_angle_test": "repose"},
+    )
+    assert asked.slope == pytest.approx(0.5 * (0.5 + tangent))

@@ -256,8 +256,8 @@ def test_a_phase_in_radians_is_reported(phase: float, hint: str | None, tmp_path
 @pytest.mark.parametrize(
     ("sand", "material", "key"),
     [
-        ({"friction_angle": 50.0}, {}, r"sand\[0\]\.friction_angle = 50\.0: must be at most 45"),
-        ({}, {"friction_angle": 50.0}, r"material\.friction_angle = 50\.0: must be at most 45"),
+        ({"friction_angle": 51.0}, {}, r"sand\[0\]\.friction_angle = 51\.0: must be at most 50\.7"),
+        ({}, {"friction_angle": 51.0}, r"material\.friction_angle = 51\.0: must be at most 50\.7"),
         (
             {},
             {"name": "gravel", "friction_angle_test": "triaxial-compression"},

@@ -308,7 +308,7 @@ CASES = {
     "gauge": OnOffModel({"gauge": {"height": 0.2}}, columns=("flow_rate",), sand=True),
     "cohesion": OnOffModel({"material": {"cohesion": 200.0, "tensile_strength": 50.0}}, sand=True),
     "diagnostics of sand": OnOffModel(
-        {"output": {}}, columns=("yielded", "dissipation", "predicted_excess"), sand=True
+        {"output": {}}, columns=("yielded", "dissipation", "predicted_excess", "front"), sand=True
     ),
     "density correction of sand": OnOffModel(
         {"density_correction": {}},

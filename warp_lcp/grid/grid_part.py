@@ -465,11 +465,11 @@ class GridPart:
         """
         convert(x.flatten(), field.flatten())
 
-    def poisson(self, cells: np.ndarray, **coefficients: Unpack[PoissonArguments]) -> GridPoisson:
+    def poisson(self, cells: np.ndarray, **options: Unpack[PoissonArguments]) -> GridPoisson:
         """Return the operator of all processes' problem on the owned cells.
 
-        Coefficients are fields of `box_like`, see `GridPoisson`.
+        The options are coefficients, fields of `box_like`, and periodic axes; see `GridPoisson`.
         """
         return GridPoisson(
-            cells, device=self.grid.device, decomposition=self.decomposition, **coefficients
+            cells, device=self.grid.device, decomposition=self.decomposition, **options
         )

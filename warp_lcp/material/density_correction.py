@@ -14,13 +14,14 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import ActiveWindow, DirtyRegion, StaggeredGrid, Window
 from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import KernelFile, StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import LaunchGraph, launch
+from warp_lcp.kernels.launch_graph import LaunchGraph, copy, launch
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
@@ -108,7 +109,9 @@ class DensityMonitor:
         """
         if density is None:
             density = self._density = self.grid.field() if self._density is None else self._density
-            density_of_all(self.grid, particles, window, self.particles_a_cell, density)
+            density_of_all(
+                self.grid, self.boundary.sides, particles, window, self.particles_a_cell, density
+            )
         self._known = None
         self._cells.move_to(self._trail.through(window))
         self._measuring.run(density, variant=self._cells.near is None)
@@ -135,6 +138,7 @@ class DensityMonitor:
 
 def density_of_all(
     grid: StaggeredGrid,
+    sides: PeriodicSides | None,
     particles: Particles,
     window: Window,
     particles_a_cell: int,
@@ -142,11 +146,35 @@ def density_of_all(
 ) -> None:
     """Compute the density of all processes' particles; collective.
 
-    Arguments as of `particle_density`.
+    Args:
+        grid: the grid.
+        sides: its periodic sides; None if there are none.
+        particles: as of `particle_density`, like the other arguments.
+        window: likewise.
+        particles_a_cell: likewise.
+        density: likewise (written); also complete beside periodic sides.
     """
     particles.exchange_ghost_positions()
-    particle_density(grid, particles, window, particles_a_cell, density)
+    joined_density(grid, sides, particles, window, particles_a_cell, density)
     particles.drop_ghosts()
+
+
+def joined_density(
+    grid: StaggeredGrid,
+    sides: PeriodicSides | None,
+    particles: Particles,
+    window: Window,
+    particles_a_cell: int,
+    density: wp.array,
+) -> None:
+    """Launch the density of particles, with the ghosts of other processes among them.
+
+    Beside a periodic side a kernel reaches beyond the domain. What it adds to the ring there
+    belongs to the cells at the opposite side. Arguments as of `density_of_all`.
+    """
+    particle_density(grid, particles, window, particles_a_cell, density)
+    if sides is not None:
+        sides.add(density)
     grid.part.fill(density)
 
 
@@ -217,6 +245,11 @@ class DensityCorrection:
     between them may be closed and count particles beyond a thin wall; SHIFT keeps their problem
     solvable.
 
+    Along periodic axes densities, x and d continue at the opposite side, and so does the operator.
+    Periodic axes alone do not make it singular: the surface is still there, x = 0 above it. Only
+    material that fills the room between two walls has constants in its null space, as in any closed
+    room.
+
     Args:
         grid: the grid.
         boundary: solids and walls.
@@ -286,6 +319,8 @@ class DensityCorrection:
         # Fields of a rank's part, and those of its problem.
         self._copied: list[tuple[wp.array, wp.array]] = []
         self._copied_faces: list[tuple[wp.array, wp.array]] = []
+        # Open fractions of faces, and those of the problem beside periodic sides.
+        self._joined_faces: list[tuple[wp.array, wp.array]] = []
         self._guess = grid.part.box_like(self.x).flatten()
         self._way = Scalar()  # factor on the displacement [m]
         launches = (
@@ -364,25 +399,35 @@ class DensityCorrection:
                 dx=self._way,
                 d=field,
             )
+        self._wrap(*self.displacement)
 
     def _launch_preparation(
         self, particles: Particles, window: Window, fill: Fill | None, contact: wp.array | None
     ) -> None:
         """Launch the density and the set-up of the problem."""
-        particle_density(self.grid, particles, window, self.particles_a_cell, self.density)
-        self.grid.part.fill(self.density)
+        joined_density(
+            self.grid, self.boundary.sides, particles, window, self.particles_a_cell, self.density
+        )
         if fill is not None:
             fill(window, self.density)
         self._prepare(contact)
 
     def _displace_particles(self, particles: Particles) -> None:
         self.boundary.displace(self.displacement, particles.position)
+        if self.boundary.sides is not None:
+            self.boundary.sides.carry(particles.position)
+
+    def _wrap(self, *fields: wp.array) -> None:
+        """Launch the filling of the ring of fields beyond periodic sides, if there are any."""
+        if self.boundary.sides is not None:
+            self.boundary.sides.wrap(*fields)
 
     def _store_solution(self, x: wp.array) -> None:
         """Store the solution of the problem."""
         part = self.grid.part
         part.store(x, self.x, self._guess)
         part.fill(self._kind)
+        self._wrap(self.x, self._kind)
 
     def _prepare(self, contact: wp.array | None) -> None:
         """Set up the problem, and count overfull cells.
@@ -397,6 +442,7 @@ class DensityCorrection:
         )
         if self._inside is not None:
             self.grid.part.fill(self._inside)  # before those deep inside are told by them
+            self._wrap(self._inside)
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
             self._lacking.launch(
                 self._solved, fields, least=least, planes=planes, lower=self._lower
@@ -471,6 +517,11 @@ class DensityCorrection:
             None if field is None else part.box_like(field) for field in (self._lower, self._shift)
         )
         faces = [part.box_like(field) for field in opened]
+        sides = self.boundary.sides
+        around = (False,) * 3 if sides is None else tuple(axis in sides.axes for axis in range(3))
+        if sides is not None:
+            faces = [wp.empty_like(field) for field in opened]
+            self._joined_faces = [*zip(opened, faces, strict=True)]
         if part.shared:
             pairs = [
                 (self._kind, self._cells),
@@ -484,7 +535,9 @@ class DensityCorrection:
         self._copy_cells()
         self._copy_faces()
         named = dict(zip(("face_x", "face_y", "face_z"), faces, strict=False))
-        self._operator = part.poisson(self.grid.interior(self._cells.numpy()), shift=shift, **named)
+        self._operator = part.poisson(
+            self.grid.interior(self._cells.numpy()), shift=shift, periodic=around, **named
+        )
         return wl.LCP(self._operator, b, 0.0 if lower is None else lower, np.inf)
 
     def _copy_cells(self) -> None:
@@ -493,9 +546,16 @@ class DensityCorrection:
             self.grid.part.copy_to_box(field, box)
 
     def _copy_faces(self) -> None:
-        """Copy the faces' open fractions to a rank's problem."""
+        """Copy the faces' open fractions to a rank's problem, or to one with periodic sides.
+
+        The first and the last faces of a periodic axis are the same faces. Their fractions may
+        differ a little, since solids may; those of the first face hold.
+        """
         for field, box in self._copied_faces:
             self.grid.part.copy_to_box(field, box)
+        for field, joined in self._joined_faces:
+            copy(joined, field)
+            self._wrap(joined)
 
 
 __getattr__ = renamed_names(__name__, Crowding="DensityMonitor")

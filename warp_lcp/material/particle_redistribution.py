@@ -238,13 +238,6 @@ class ParticleRedistribution:
         evens = ("reseeded",) if self.reseeding is not None else ()
         return (*evens, *CORRECTION_COLUMNS) if self._scene.correction is not None else evens
 
-    def notes(self) -> list[str]:
-        """Return why no density correction acts, if the program was to decide."""
-        if self._scene.density_correction is not None or self.density_monitor is not None:
-            return []
-        none = "density correction is off: it is not available with periodic axes"
-        return [none] if self._scene.endless else []
-
     def state(self) -> dict[str, np.ndarray]:
         """Return the solution that the next correction starts from, if there was one."""
         return {} if self.correction is None else {STATE: self.correction.x.numpy().copy()}

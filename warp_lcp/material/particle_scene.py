@@ -180,7 +180,7 @@ class ParticleScene(Scene):
         """
         given = self.density_correction
         if given is None:
-            if self.endless or self.stays_full or self.settles:
+            if self.stays_full or self.settles:
                 return None
             given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
         return given if given.every else None

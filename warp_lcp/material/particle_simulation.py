@@ -154,7 +154,7 @@ class ParticleSimulation(ParticleCheckpoints):
         others = set(vars(self))
         self.allocate(grid, parts)
         self._laid = vars(self).keys() - others  # attributes that belong to a grid
-        self._notes = [*notes, *self.rearrangement.notes()]
+        self._notes = list(notes)
         if self.sources is not None:
             self.sources.emit(particles, None, self.time)
         particles.sort()

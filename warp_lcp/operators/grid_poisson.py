@@ -43,12 +43,13 @@ Face: TypeAlias = Array | float  # of all faces along an axis, or one number
 
 
 class PoissonArguments(TypedDict, total=False):
-    """Coefficients of `GridPoisson`, see there."""
+    """Coefficients and periodic axes of `GridPoisson`, see there."""
 
     face_x: Face
     face_y: Face
     face_z: Face
     shift: Array | float | None
+    periodic: tuple[bool, ...]
 
 
 AXES = "xyz"
