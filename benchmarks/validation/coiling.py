@@ -140,10 +140,10 @@ def sheet(findings: Findings, cells: int) -> None:
         ratio = math.log(abs(eta[-1] / eta[1])) / math.log(exact[-1] / exact[1])
         if numerics is STAIRS:
             findings.must_break(
-                "surface on cell faces: growth over exact", ratio, low=0.95, high=1.05
+                "surface on cell faces: growth over exact", ratio, low=0.97, high=1.03
             )
             continue
-        findings.add("growth over exact", ratio, low=0.95, high=1.05)
+        findings.add("growth over exact", ratio, low=0.97, high=1.03)
         findings.curve("deflection", time, eta)
 
 
