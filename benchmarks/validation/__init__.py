@@ -15,6 +15,7 @@ from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import Chart, RecordTable, Results
 from warp_lcp.benchmarks.harness.timing import Options
 from warp_lcp.benchmarks.validation import (
+    coiling,
     dam_break,
     flight,
     floating,
@@ -45,6 +46,8 @@ CHECKS = {
     "volume": dam_break.VOLUME,
     "floating": floating.CHECK,
     "viscous": viscous.CHECK,
+    "buckling": coiling.BUCKLING,
+    "coiling": coiling.COILING,
     "inclined layer": inclined.LAYERS,
     "sand collapse": sand_collapse.COLLAPSES,
     "sand hourglass": sand_hourglass.CHECK,
