@@ -13,7 +13,7 @@ import pytest
 import scipy.optimize
 
 from command_line import succeed
-from default_run import few
+from default_run import few, slow
 from every_step import differences_by_step
 from warp_lcp.contacts.kinematics import KinematicSimulation
 from warp_lcp.contacts.methods import JOINTED, KINEMATIC
@@ -267,8 +267,7 @@ def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     assert (tmp_path / "run" / "images" / "frame_000001.png").stat().st_size > 1000
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("limit", [2.0, 60.0])
+@pytest.mark.parametrize("limit", [2.0, slow(60.0)])
 def test_an_arch_is_held_up_by_the_limits_of_its_hinges(limit: float) -> None:
     """Arch held up by the limits of its hinges.
 
@@ -308,24 +307,23 @@ def test_a_pyramid_of_gears_settles_between_its_posts() -> None:
     assert (np.diff([y[:3].mean(), y[3:5].mean(), y[5]]) > 0.4).all()
 
 
-@pytest.mark.slow
-def test_a_gear_turns_one_with_twice_its_teeth_half_as_fast() -> None:
+@pytest.mark.parametrize("until", [0.3, slow(4.0)])
+def test_a_gear_turns_one_with_twice_its_teeth_half_as_fast(until: float) -> None:
     """Gear with half the teeth of the other, at twice its speed.
 
     No tooth is skipped: the difference stays within the play between teeth, a third of their
     distance of 30 degrees.
     """
-    scene = loaded("gears")
-    simulation, turned = made(scene), np.zeros(2)
+    simulation, turned = made(loaded("gears")), np.zeros(2)
     before = np.zeros(2)
-    while simulation.time < scene.time.duration - 1e-9:
+    while simulation.time < until - 1e-9:
         row = simulation.step(min(simulation.stable_dt(), 0.01))
         now = np.array([row["joint0_angle"], row["joint3_angle"]])
         turned += (now - before + 180.0) % 360.0 - 180.0
         before = now
         assert abs(turned[1] + 0.5 * turned[0]) < 10.0
         assert row["joint_error"] < 1e-7
-    assert turned[0] == pytest.approx(90.0 * scene.time.duration, rel=0.02)
+    assert turned[0] == pytest.approx(90.0 * until, abs=0.02 * 360.0)
 
 
 @pytest.mark.slow
