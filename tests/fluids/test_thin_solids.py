@@ -10,6 +10,7 @@ import warp as wp
 from default_run import covering, slow
 from small_liquids import GRAVITY, advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
+from warp_lcp.operators.grid_poisson import AIR, SOLID
 from warp_lcp.scene.scene_file import built_in_scenes, load_scene
 from warp_lcp.scene.simulator import simulators
 
@@ -341,6 +342,31 @@ def test_a_bottle_shaken_hard_keeps_its_volume(
     assert np.mean(volumes[half:]) == pytest.approx(0.6 * (high - low) ** 2, rel=0.05)
     # 0.88 for bottles that are shaken gently; 0.52 to 0.78 where only gravity spreads the liquid.
     assert np.mean(filled_cells[half:]) > 0.82
+
+
+def test_reseeding_takes_cells_beside_a_sheet_for_solid_ones() -> None:
+    """Kinds of cells for reseeding: those that a sheet cuts are taken for solid, others as is.
+
+    A particle copied in such a cell could come to lie on the other side.
+    """
+    block = box([0.3, 0.25], [0.7, 0.6])  # thick: cells inside are solid
+    grid_and_walls = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=CELLS,
+            liquid=[box([0.0, 0.0], [1.0, 0.2])],
+            solid=[box([-0.1, 0.72], [1.1, 0.73]), block],
+        )
+    )
+    barriers, base = grid_and_walls.grid.barriers, grid_and_walls.boundary.cut.base.numpy()
+    assert barriers is not None
+    inside = np.s_[base.shape[0] // 2, 1:-1, 1:-1]
+    calm, base, near = (
+        field[inside] for field in (barriers.calm.numpy(), base, barriers.near.numpy())
+    )
+    assert (calm[int(0.725 * CELLS)] == SOLID).all()
+    np.testing.assert_array_equal(calm[near == 0], base[near == 0])
+    assert {*base[near == 0].tolist()} == {AIR, SOLID}
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
