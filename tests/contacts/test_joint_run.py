@@ -21,6 +21,7 @@ from warp_lcp.contacts.scene import ContactScene
 from warp_lcp.contacts.simulator import ContactSimulation, ContactSimulator
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
+from warp_lcp.simulation import Surface
 
 Z = [0.0, 0.0, 1.0]
 
@@ -173,6 +174,12 @@ def test_an_arm_reaches_as_far_as_its_limits_let_it(method: str) -> None:
     assert row["target_error"] == pytest.approx(float(np.linalg.norm(best.fun)), abs=1e-5)
     tip = simulation.bodies.motions[1].pose(simulation.time).apply(np.array([REACH["point"]]))[0]
     assert tip - goal == pytest.approx(best.fun, abs=1e-5)
+    # The target's marker is around it, and small beside the arm of 0.9 m.
+    (part,) = simulation.frame()
+    assert isinstance(part, Surface)
+    ways = part.points[part.fields["body"] == len(simulation.bodies.bodies)] - goal
+    assert ways.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-6)
+    assert np.abs(ways).max() == pytest.approx(0.03 * 0.9, rel=0.05)
 
 
 @pytest.mark.parametrize(
