@@ -37,7 +37,7 @@ test-distributed:
 # to launch every kernel in three orders.
 EMULATED ?= tests/solvers/test_table.py tests/multigrid/test_fused_levels.py tests/grid/test_transfer.py \
 	tests/solvers/test_device_iteration.py tests/grid/test_window_reduction.py tests/kernels/test_joined_graphs.py tests/granular/test_stress_device_iteration.py tests/granular/test_runout.py \
-	tests/test_as_on_cuda.py
+	tests/kernels/test_quads.py tests/grid/test_particles.py tests/multigrid/test_rebuild.py tests/test_as_on_cuda.py
 emulated-cuda: $(VENV)/.dev
 	PYTHONPATH=tests:. $(BIN)/python -m pytest -p emulated_cuda -n $(WORKERS) --dist worksteal $(EMULATED) $(PYTEST_ARGS)
 

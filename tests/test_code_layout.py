@@ -1,6 +1,6 @@
 """Layout of the source: line width, class names, exemptions of the formatter.
 
-A line has at most 100 columns, and a class name is defined once.
+A line has at most 100 columns; a class name is defined once, and a file of tests has its own name.
 """
 
 import re
@@ -57,3 +57,9 @@ def test_the_formatter_has_no_exemptions():
 def test_a_class_name_is_defined_once():
     defined = Counter(name for path in sources("*.py") for name, _ in classes(path))
     assert [name for name, count in defined.items() if count > 1] == []
+
+
+def test_a_file_of_tests_has_a_name_of_its_own():
+    """Pytest imports test files by their names, without folders: it refuses the second one."""
+    names = Counter(path.name for path in sources("*.py") if path.name.startswith("test_"))
+    assert [name for name, count in names.items() if count > 1] == []

@@ -63,6 +63,7 @@ def test_operators():
         ),
         ({"solver": wl.Lemke}, "solver is the class Lemke"),
         ({"stopping": 1e-6}, "stopping is a float"),
+        ({"solver": wl.Lemke(), "stopping": 1e-6}, "stopping is a float"),
         ({"x0": 0.0}, r"x0 has shape \(\)"),
         ({"x0": "zero"}, "x0 is a str"),
         ({"x0": [0.0, np.nan]}, "x0 holds 1 values that are not finite"),

@@ -88,9 +88,10 @@ class MutantBudget:
         wp.Module.load = timed_load
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        """Keep the first parameter of each function."""
+        """Keep the first parameter of each function that runs by default."""
         if self.brief:
-            items[:] = {item.nodeid.split("[")[0]: item for item in reversed(items)}.values()
+            default = [item for item in items if not item.get_closest_marker("slow")]
+            items[:] = {item.nodeid.split("[")[0]: item for item in reversed(default)}.values()
             items.reverse()
 
     def pytest_runtest_setup(self, item: pytest.Item) -> None:

@@ -191,6 +191,10 @@ def test_a_run_is_served_and_shown_from_its_beginning(dots, tmp_path, monkeypatc
     assert result.exit_code == 0, result.output
     assert "page: http://127.0.0.1:" in result.output
     assert opened == [["view", str(out)]]
+    plain = CliRunner().invoke(
+        cli.app, ["run", str(scene), "--out", str(tmp_path / "plain"), "--device", "cpu"]
+    )
+    assert plain.exit_code == 0 and "page:" not in plain.output and len(opened) == 1
     monkeypatch.delenv("DISPLAY")
     refused = CliRunner().invoke(
         cli.app, ["run", str(scene), "--out", str(tmp_path / "other"), "--view", "--device", "cpu"]

@@ -439,9 +439,10 @@ def test_couette_flow_between_cut_walls() -> None:
     assert errors[0] / errors[1] > 2.8
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("slip", [0.0, 0.1])
-def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
+@pytest.mark.parametrize(
+    ("slip", "until"), [(0.0, 6.0), (0.1, 6.0), *map(slow, [(0.0, 12.0), (0.1, 12.0)])]
+)
+def test_a_block_spreads_as_a_gravity_current(slip: float, until: float) -> None:
     """Front of a thin layer on a no-slip floor.
 
     It is at 1.411 (g q^3 t / (3 nu))^(1/5) (Huppert 1982), where q is the area on each side of the
@@ -455,19 +456,20 @@ def test_a_block_spreads_as_a_gravity_current(slip: float) -> None:
         scene(size=[4.0, 1.0], resolution=96, liquid=[box([1.75, 0.0], [2.25, 0.5])], **given)
     )
     fronts = []
-    while simulation.time < 12.0:
-        simulation.step(min(simulation.stable_dt(), 0.05))
+    while simulation.time < until:
+        simulation.step(min(simulation.stable_dt(), until / 120.0))
         x = simulation.particles.position.numpy()[:, 0]
         fronts.append([simulation.time, 0.5 * float(x.max() - x.min())])
-    t, front = np.array([row for row in fronts if row[0] > 6.0]).T
+    t, front = np.array([row for row in fronts if row[0] > 0.5 * until]).T
     expected = 1.411 * (10.0 * 0.125**3 / 3.0) ** 0.2
-    # The initial block is not the similarity solution; the rate depends less on it.
+    # The initial block is not the similarity solution; the rate depends less on it, and the front
+    # less and less.
     rate = np.polyfit(t, front**5, 1)[0] ** 0.2 / expected
     if slip:
         assert rate > 1.1  # only the floor slows it
     else:
         assert abs(rate - 1.0) < 0.05
-        assert abs(front[-1] / (expected * t[-1] ** 0.2) - 1.0) < 0.05
+        assert abs(front[-1] / (expected * t[-1] ** 0.2) - 1.0) < 0.6 / until
 
 
 def test_a_slip_length_moves_the_wall_away() -> None:

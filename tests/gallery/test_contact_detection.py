@@ -119,6 +119,24 @@ def test_crossed_edges_meet_in_a_point():
     np.testing.assert_allclose(swapped[0], points, atol=1e-12)
 
 
+@pytest.mark.parametrize("angle", [0.4, 1.1, 2.5])
+def test_oblique_edges_meet_where_their_lines_cross(angle):
+    """Point between an edge along x and one at an angle to it, seen from above.
+
+    Their lines cross above (0.1, 0); the second edge's middle is 0.2 along it from there.
+    """
+    h, along = 0.5, np.array([np.cos(angle), np.sin(angle), 0.0])
+    a = OrientedBox(np.zeros(3), turn(np.pi / 4, 0, 0).as_matrix(), np.full(3, h))
+    rotation = turn(0, 0, angle) * turn(np.pi / 4, 0, 0)
+    center = np.array([0.1, 0.0, 2 * h * np.sqrt(2) + 0.01]) + 0.2 * along
+    points, normal, gaps = box_box(
+        a, OrientedBox(center, rotation.as_matrix(), np.full(3, h)), 0.02
+    )
+    np.testing.assert_allclose(normal, [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(points, [[0.1, 0.0, h * np.sqrt(2) + 0.005]], atol=1e-12)
+    np.testing.assert_allclose(gaps, [0.01], atol=1e-12)
+
+
 def test_a_sphere_at_a_box_from_outside_and_inside():
     cube = box([0, 0, 0], (0.5,) * 3)
     contacts = world_of(cube, ball([0.6, 0.6, 0.0], 0.2)).contacts(margin=0.01)

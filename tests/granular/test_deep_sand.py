@@ -56,16 +56,23 @@ def test_a_cold_start_takes_iterations_as_the_sand_is_deep(cells: int, friction:
     assert row["solve_iterations"] <= (3.0 if friction else 5.0) * cells + 40
 
 
-@pytest.mark.slow
-def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields() -> None:
+@pytest.mark.parametrize(
+    ("cells", "depth", "slot", "steps"), [(12, 24, 4, 20), slow((24, 48, 6, 30))]
+)
+def test_a_limit_of_the_momentum_leaves_less_of_the_residual_where_deep_sand_yields(
+    cells: int, depth: int, slot: int, steps: int
+) -> None:
     """Limit of the momentum: smaller residual where deep sand yields.
 
     Sand of 40 degrees runs out of a silo: pressure and the friction's bound amplify each other.
     """
     medians = []
     for limits in ((), HeavyBallProjectedGradient().calm):
-        simulation = silo(24, 48, 6, material={"friction_angle": 40.0}, density_correction={})
+        simulation = silo(
+            cells, depth, slot, material={"friction_angle": 40.0}, density_correction={}
+        )
         simulation.method = HeavyBallProjectedGradient(calm=limits)
-        rows = [simulation.step(min(simulation.stable_dt(), 0.01)) for _ in range(30)]
-        medians.append(float(np.median([row["coupled_residual"] for row in rows[10:]])))
+        rows = [simulation.step(min(simulation.stable_dt(), 0.01)) for _ in range(steps)]
+        residuals = [row["coupled_residual"] for row in rows[steps // 3 :]]
+        medians.append(float(np.median(residuals)))
     assert medians[1] < 0.75 * medians[0]

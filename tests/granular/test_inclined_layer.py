@@ -5,6 +5,7 @@ All angles and resolutions are in the suite `validation`.
 
 import pytest
 
+from default_run import slow
 from warp_lcp.benchmarks.validation import inclined
 
 
@@ -14,14 +15,14 @@ def test_the_cone_slides_at_the_friction_angle_and_the_box_does_not() -> None:
     assert trial.findings[-1].control
 
 
-@pytest.mark.slow
-def test_a_stiff_slab_rests_and_slides_as_the_walls_friction_says() -> None:
+@pytest.mark.parametrize("cells", [6, slow(12)])
+def test_a_stiff_slab_rests_and_slides_as_the_walls_friction_says(cells: int) -> None:
     """Rest and sliding of a stiff slab by the wall friction.
 
     If half of the sand above the last full row were weightless, the acceleration would be more than
     1.5 times too large.
     """
-    trial = inclined.slab(12, angles=(26.8,))
+    trial = inclined.slab(cells, angles=(26.8,))
     assert trial.failures() == []
     assert trial.findings[1].what == "26.8 degrees: acceleration over expected"
     assert trial.findings[1].value == pytest.approx(1.0, rel=0.02)

@@ -6,6 +6,7 @@ All resolutions and negative controls are in the suite `validation`.
 import numpy as np
 import pytest
 
+from default_run import slow
 from warp_lcp.benchmarks.validation import sand_collapse, sand_hourglass, scenes
 
 
@@ -47,16 +48,16 @@ def test_half_the_friction_runs_too_far() -> None:
     assert c.runout > sand_collapse.envelope(2.0)[1]
 
 
-@pytest.mark.slow
-def test_sand_runs_out_evenly(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("cells", [6, slow(8)])
+def test_sand_runs_out_evenly(cells: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Even discharge of sand.
 
     That of a liquid would fall by 15 % with the fill.
     """
     monkeypatch.setattr(sand_hourglass, "SPACING", 0.01)
-    d = sand_hourglass.sand(8, 1)
+    d = sand_hourglass.sand(cells, 1)
     assert d.spread < 8.0
-    assert d.rate.mean() == pytest.approx((9.81 * 0.08**3) ** 0.5, rel=0.3)
+    assert d.rate.mean() == pytest.approx((9.81 * (0.01 * cells) ** 3) ** 0.5, rel=0.3)
 
 
 def test_rates_are_areas_over_times() -> None:
@@ -76,12 +77,12 @@ def test_a_collapse_keeps_its_invariants() -> None:
     assert trial.findings[-1].passed
 
 
-@pytest.mark.slow
-def test_a_pile_at_rest_hardly_moves_inside() -> None:
-    (_, deep), (whole, later) = sand_collapse.rest(10, 2)
-    assert max(deep, later) < sand_collapse.DEEP
+@pytest.mark.parametrize(("cells", "watches"), [(8, 1), slow((10, 2))])
+def test_a_pile_at_rest_hardly_moves_inside(cells: int, watches: int) -> None:
+    whole, deep = np.array(sand_collapse.rest(cells, watches)).T
+    assert deep.max() < sand_collapse.DEEP
     # Few cells have a large share of the surface, where a grain still slides at first.
-    assert whole < sand_collapse.ALL
+    assert whole[-1] < sand_collapse.ALL
 
 
 def test_drift_is_the_way_of_each_particle_whatever_their_order(

@@ -20,6 +20,7 @@ from warp_lcp.kernels.kernel_variant import KernelVariant
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
 from warp_lcp.material.density_correction import LONGEST, DensityCorrection
+from warp_lcp.material.particle_redistribution import SEVERE
 
 BALL = {"shape": "sphere", "center": [0.5, 0.5], "radius": 0.23}
 
@@ -336,6 +337,32 @@ def test_the_automatic_correction_is_proportional_to_the_step() -> None:
     asked = lift(1e-3, density_correction={})
     assert lift(1e-3) == pytest.approx(10.0 * lift(1e-4), rel=0.05)
     assert 0.0 < lift(1e-3) < 0.1 * asked
+
+
+@pytest.mark.parametrize("moves", [True, False])
+def test_a_step_repeats_the_correction_of_severe_excess_beside_moving_solids(moves: bool) -> None:
+    """Excess after a step of a pool of which each particle has 3/4 of its height.
+
+    Its surface must rise by two cells, and a correction moves particles by half a cell at most.
+    """
+    plate = box([0.4, 0.42], [0.6, 0.46])
+    if moves:
+        plate["motion"] = {"kind": "translation", "velocity": [0.01, 0.0]}
+    squeezed = pool(solid=[plate])
+    position = squeezed.particles.position.numpy() * np.array([1.0, 0.75, 1.0], dtype=np.float32)
+    squeezed.particles.position.assign(position)
+    squeezed.particles.sort()
+    squeezed.step(1e-4)
+    squeezed.particles.sort()
+    monitor = squeezed.rearrangement.density_monitor
+    assert monitor is not None
+    monitor.measure(None, squeezed.particles, squeezed.window(squeezed.particles.totals()))
+    excess, _ = monitor.read_densities()
+    assert excess <= SEVERE if moves else excess > 4.0 * SEVERE
+    # The center of mass has gone up by nearly all of the way to its place at rest.
+    way = float(squeezed.particles.totals().center[1] - position[:, 1].mean())
+    assert way < 0.5 * 0.25 / 3.0
+    assert (way > 0.8 * 0.5 * 0.25 / 3.0) == moves
 
 
 @pytest.mark.parametrize("table", [{}, {"density_correction": {"every": 0}}])

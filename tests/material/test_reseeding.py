@@ -179,6 +179,14 @@ def test_only_a_scene_with_the_setting_has_reseeding() -> None:
     ]
 
 
+@pytest.mark.parametrize(("least", "most"), [(0, 8), (5, 8), (2, 3)])
+def test_a_cell_of_particles_at_rest_is_within_the_bounds(least: int, most: int) -> None:
+    """The bounds are 1 <= least <= 4 <= most; without particles there is nothing to copy."""
+    with pytest.raises(ValueError, match=f"least = {least}, most = {most}: must be at least 1"):
+        reseeding(pool(2), least, most)
+    reseeding(pool(2), 1, 4)
+
+
 @pytest.mark.parametrize(("reseed", "key"), [({"min": 5}, "min"), ({"max": 3}, "max")])
 def test_bounds_that_exclude_rest_are_refused(reseed: dict[str, int], key: str) -> None:
     with pytest.raises(

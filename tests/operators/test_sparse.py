@@ -278,3 +278,17 @@ def test_row_starts_that_fall_are_refused():
     A.indptr[2] = 4
     with pytest.raises(ValueError, match="matrix is not a valid sparse matrix"):
         wl.SparseOperator(A, device="cpu")
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_the_rows_of_a_matrix_are_the_matrix(full):
+    A = np.random.default_rng(677).standard_normal((7, 7))
+    if not full:
+        A[np.abs(A) < 0.8] = 0.0
+    operator = (
+        wl.DenseOperator(A, device="cpu")
+        if full
+        else wl.SparseOperator(scipy.sparse.csr_array(A), device="cpu")
+    )
+    rows = operator.rows().matrix()
+    np.testing.assert_array_equal(rows if full else rows.toarray(), A)

@@ -258,6 +258,14 @@ def test_a_state_is_restored_bit_for_bit():
     assert (one.state() == other.state()).all()
 
 
+def test_a_state_has_the_motion_and_no_received_impulses():
+    one = tumbling()
+    before = one.state()
+    assert before.shape == (20,)
+    one.received_impulse = np.ones(6)
+    np.testing.assert_array_equal(one.state(), before)
+
+
 @pytest.mark.parametrize(
     "bad", [{"friction": -0.1}, {"friction": np.inf}, {"restitution": 1.5}, {"restitution": -0.1}]
 )

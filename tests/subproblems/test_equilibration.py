@@ -13,6 +13,7 @@ from default_run import covering
 from matrices import posed
 from oracle import boxed, lemke
 from warp_lcp.solvers.interior_point import InteriorPoint
+from warp_lcp.subproblems.dense_problem import DenseProblem
 from warp_lcp.subproblems.equilibration import EquilibratedWorkspace
 
 TIGHT = wl.StoppingCriteria(rtol=1e-10)
@@ -172,3 +173,24 @@ def test_a_guess_and_rows_without_a_diagonal_entry():
         result = wl.solve(posed(A, b, "dense"), InteriorPoint(), x0=x0, stopping=TIGHT)
         assert result, result.status
         np.testing.assert_allclose(result.x.numpy() * D, [1.0, 1.0], atol=1e-4)
+
+
+@pytest.mark.parametrize("symmetric", [False, True])
+def test_a_dense_problem_in_other_units_is_the_same_problem(symmetric):
+    """Units of x = beta C x' and of y = beta R^-1 y': those of y do not depend on x.
+
+    Bounds are those of x in its units. Units are powers of 2, so that equalities hold to rounding.
+    """
+    rng, n = np.random.default_rng(673), 12
+    rows, columns = (10 ** rng.uniform(-6, 6, n) for _ in range(2))
+    columns = rows if symmetric else columns
+    A = rows[:, None] * matrix("dense", rng)[:n, :n] * columns
+    b, lower = 1e3 * rows * rng.standard_normal(n), -rng.uniform(0.0, 1.0, n) / columns
+    problem = DenseProblem(np.arange(n), A, b, lower, np.full(n, np.inf), symmetric)
+    scaled, units = problem.scaled()
+    np.testing.assert_array_equal(np.log2(units) % 1.0, 0.0)
+    np.testing.assert_array_equal(scaled.lower * units, lower)
+    ratios = [problem.affine(units * x) / scaled.affine(x) for x in rng.standard_normal((3, n))]
+    np.testing.assert_allclose(ratios[1:], [ratios[0]] * 2, rtol=1e-6)
+    if symmetric:
+        assert 0.2 < np.abs(scaled.A).max() < 5.0

@@ -4,6 +4,7 @@
 // late.
 #include <cstddef>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <pthread.h>
 #include <sched.h>
@@ -45,8 +46,11 @@ static void all(void*, void* given) {
     odd = left % 2;
 }
 
-int main() {
-    enum { SIZE = 4, ROUNDS = 3000 };
+// Arguments: the number of rounds, and the planes between slabs; without a plane neighbors race.
+int main(int, char** given) {
+    enum { SIZE = 4 };
+    const int rounds = atoi(given[1]);
+    const U gap = atoi(given[2]);
     std::vector<U> team(64 + 8 * SIZE, 0);
     void* calls[] = {(void*)sched_yield,
                      (void*)clock_gettime,
@@ -70,7 +74,7 @@ int main() {
         return std::vector<U>{(U)f, 0, (U)a, sizeof(Arguments), 1, CELLS_, lag, 1, 0, 0};
     };
     std::vector<U> first = stage(add, &plus, 0), wave = stage(add, &twice, 0),
-                   last = stage(all, &none, 0), after = stage(next, &none, 1);
+                   last = stage(all, &none, 0), after = stage(next, &none, gap);
     // The first operation reads `three` and its number of tasks when it runs.
     int three = 3;
     const U tasks = CELLS_;
@@ -95,7 +99,7 @@ int main() {
     table[21] = (U)&left;
     table[18] = (U)words;
     int wrong = 0, resumed = 0, between = 0;
-    for (int round = 0; round < ROUNDS; ++round) {
+    for (int round = 0; round < rounds; ++round) {
         const int share = round % 5 ? 1 : 0;
         const long long limit = round % 7 ? 1LL << 40 : 0;
         const int runs = 1 + round % 3;  // consecutive runs in native code
@@ -134,7 +138,7 @@ int main() {
     }
     work_through((U)team.data(), 0, 3, 0, 0, 0);
     for (auto& other : others) other.join();
-    printf("%d rounds, %d wrong, %d resumed, %d of them between runs\n", (int)ROUNDS, wrong,
-           resumed, between);
+    printf("%d rounds, %d wrong, %d resumed, %d of them between runs\n", rounds, wrong, resumed,
+           between);
     return wrong != 0 || !between;
 }
