@@ -28,7 +28,7 @@ import os
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict, TypeVar
@@ -196,6 +196,12 @@ class TreeWorker:
         self._process.wait()
 
 
+def end_all(workers: Iterable[TreeWorker]) -> None:
+    """End the processes of workers."""
+    for one in workers:
+        one.end()
+
+
 @dataclass
 class InterleavedTurns:
     """All pieces of work by all workers, with the results so far."""
@@ -256,7 +262,7 @@ def run(options: argparse.Namespace) -> int:
         for name, (tree, quads) in trees.items()
     }
     turns = InterleavedTurns(options.out, list(workers))
-    limit = threading.Timer(options.seconds + LONGER, lambda: [w.end() for w in workers.values()])
+    limit = threading.Timer(options.seconds + LONGER, end_all, [workers.values()])
     limit.daemon = True
     limit.start()
     try:
@@ -271,8 +277,7 @@ def run(options: argparse.Namespace) -> int:
             print(list(turns.page())[-1], flush=True)
     finally:
         limit.cancel()
-        for one in workers.values():
-            one.end()
+        end_all(workers.values())
     turns.write()
     print(
         f"{options.out}/turns.md and turns.json ({time.monotonic() - start_time:.0f} s)", flush=True
