@@ -1,11 +1,15 @@
 """Check the library on a GPU and write a report: `python -m benchmarks.gpu`.
 
-Run it in the source tree; the report is one page in out/gpu. It checks on the device what holds on
-the CPU: equal answers, also of each kernel; the same bits in every run; graphs against single
-launches; odd grids; hundreds of steps; constant memory use. Then it measures times, compares them
-with the estimates of `benchmarks/gpu_model.py`, and reports the share of the memory bandwidth that
-kernels reach. Failed checks are reported as well. `--rehearse` does all of it on the CPU in CUDA's
-form (`benchmarks/emulated_cuda.py`).
+Run it in the source tree; the report is one page in out/gpu. It measures times, and the share of
+the memory bandwidth that kernels reach. Then it checks on the device what holds on the CPU: equal
+answers, also of each kernel; the same bits in every run; graphs against single launches; odd grids;
+hundreds of steps; constant memory use. The estimates of `benchmarks/gpu_model.py` stand beside the
+times. Failed checks are reported as well. `--rehearse` does all of it on the CPU in CUDA's form
+(`benchmarks/emulated_cuda.py`).
+
+Each check runs in a process of its own (`benchmarks/claim_processes.py`): first those that measure,
+alone; then the others, several at the same time, because most of their time is compilation on one
+core. With `--seconds` the checks that are left are stopped after so long, and named in the report.
 """
 
 import importlib
@@ -23,6 +27,8 @@ if "--rehearse" in sys.argv:
 import argparse
 import functools
 import json
+import math
+import os
 import shutil
 import subprocess
 import time
@@ -36,6 +42,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from benchmarks.claim_processes import ClaimProcess, run_all
 from warp_lcp.benchmarks import gpu_cases, kernels
 from warp_lcp.benchmarks.harness.machine import machine
 from warp_lcp.benchmarks.harness.record import BenchmarkRecord, RecordTable
@@ -60,6 +67,34 @@ class GpuCheck:
     found: str
 
 
+@dataclass(frozen=True)
+class Claim:
+    """A claim, the method of `GpuVerdict` that checks it, and whether that measures times."""
+
+    name: str
+    method: str
+    measures: bool = False
+
+
+# In the order in which they begin: those that need the machine alone, then the longest ones.
+CLAIMS = (
+    Claim("residuals by NumPy", "residuals", measures=True),
+    Claim("times", "times", measures=True),
+    Claim("bandwidth of kernels", "bandwidth", measures=True),
+    Claim("answers equal the CPU's", "agreement"),
+    Claim("kernels agree with the CPU's, one by one", "each_kernel"),
+    Claim("the same bits in every run", "repeats"),
+    Claim("steps from graphs are those from launches", "step_graphs"),
+    Claim("steps without the host are the host's", "ahead"),
+    Claim("graphs do what launches do", "graphs"),
+    Claim("a step waits for the device twice", "waiting"),
+    Claim("memory stays", "memory"),
+    Claim("grids without unknowns are refused", "empty"),
+    Claim("times are estimated", "estimates"),
+    Claim("compute-sanitizer finds nothing", "sanitized"),
+)
+
+
 class GpuVerdict:
     """All checks of a device.
 
@@ -73,6 +108,7 @@ class GpuVerdict:
         self.device, self.rehearsal, self.out = device, rehearsal, out
         self.claims: list[GpuCheck] = []
         self.tables: list[RecordTable] = []
+        self.left_out: list[str] = []
         self.steps = 10 if rehearsal else gpu_cases.STEPS
 
     def claim(self, name: str, check: Callable[[], str | None]) -> None:
@@ -99,30 +135,65 @@ class GpuVerdict:
                 "s)",
                 flush=True,
             )
+
+    def check(self, method: str) -> None:
+        """Check one claim in this process, and write its results for `all`."""
+        (claim,) = (one for one in CLAIMS if one.method == method)
+        self.claim(claim.name, getattr(self, method))
+        results = {
+            "claims": [asdict(c) for c in self.claims],
+            "tables": [asdict(t) for t in self.tables],
+        }
+        self._results(claim).write_text(json.dumps(results))
+
+    def all(self, workers: int, seconds: float) -> None:
+        """Check all claims, each in a process.
+
+        Args:
+            workers: number of processes at the same time; those that measure times run alone.
+            seconds: time limit [s].
+        """
+        claims = {claim.name: claim for claim in CLAIMS}
+        command = [sys.executable, "-m", "benchmarks.gpu", "--device", self.device]
+        command += ["--out", str(self.out), *["--rehearse"] * self.rehearsal]
+        tasks = []
+        (self.out / "model.md").unlink(missing_ok=True)
+        for claim in CLAIMS:
+            self._results(claim).unlink(missing_ok=True)
+            tasks.append(
+                ClaimProcess(claim.name, [*command, "--claim", claim.method], claim.measures)
+            )
+        for name, status in run_all(tasks, ROOT, workers, seconds):
+            self._take(claims[name], status)
             self.write()  # the results survive if this process ends early
 
-    def all(self) -> None:
-        """Run all checks."""
-        self.claim("answers equal the CPU's", self.agreement)
-        self.claim("kernels agree with the CPU's, one by one", self.each_kernel)
-        self.claim("residuals by NumPy", self.residuals)
-        self.claim("the same bits in every run", self.repeats)
-        self.claim("graphs do what launches do", self.graphs)
-        self.claim("steps from graphs are those from launches", self.step_graphs)
-        self.claim("steps without the host are the host's", self.ahead)
-        self.claim("a step waits for the device twice", self.waiting)
-        self.claim("grids without unknowns are refused", self.empty)
-        self.claim("memory stays", self.memory)
-        self.claim("compute-sanitizer finds nothing", self.sanitized)
-        self.claim("times", self.times)
-        self.claim("bandwidth of kernels", self.bandwidth)
+    def _results(self, claim: Claim) -> Path:
+        """Return the file of a claim's results."""
+        return self.out / f"claim-{claim.method}.json"
+
+    def _take(self, claim: Claim, status: int | None) -> None:
+        """Add the results of a claim's process, which ended with a status; None: out of time."""
+        if status is None:
+            self.left_out.append(claim.name)
+        elif not self._results(claim).exists():
+            self.claims.append(GpuCheck(claim.name, False, f"its process ended with {status}"))
+            print(f"FAIL  {claim.name}: its process ended with {status}", flush=True)
+        else:
+            results = json.loads(self._results(claim).read_text())
+            self.claims += [GpuCheck(**one) for one in results["claims"]]
+            self.tables += [RecordTable(**one) for one in results["tables"]]
+            self._results(claim).unlink()
 
     def agreement(self) -> str:
         """Compare all cases with those of a process on the CPU."""
         path = self.out / "cpu.npz"
         command = [sys.executable, "-m", "benchmarks.gpu_cases", str(path), "cpu", str(self.steps)]
-        subprocess.run(command, cwd=ROOT, check=True, timeout=900, stdout=subprocess.DEVNULL)
-        results, wrong, worst = gpu_cases.everything(self.device, self.steps), [], 0.0
+        # Both compile for minutes, so they run at the same time.
+        with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as on_cpu:
+            results = gpu_cases.everything(self.device, self.steps)
+            assert on_cpu.wait() == 0, f"the process on the CPU ended with {on_cpu.returncode}"
+        wrong: list[str] = []
+        worst = 0.0
         with np.load(path) as expected:
             wrong += [f"{name} only here" for name in results.keys() - expected.keys()]
             for name, x in expected.items():
@@ -307,7 +378,7 @@ class GpuVerdict:
         return "memcheck"
 
     def times(self) -> str:
-        """Time cold solves and steps; compare them with the model's tables."""
+        """Time cold solves and steps."""
         rows, steps = [], []
         for n in (16, 32) if self.rehearsal else (128, 256, 512):
             problem, method = splash(n).lcp("walls", device=self.device), wl.ProjectedMultigrid()
@@ -341,6 +412,15 @@ class GpuVerdict:
         self.tables.append(
             RecordTable("Steps of the dam break", ["cells along x", "ms", "ms, step graphs"], steps)
         )
+        return ", ".join(
+            [
+                *(f"{cells} {ms} ms" for cells, ms, *_ in rows),
+                *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps),
+            ]
+        )
+
+    def estimates(self) -> str:
+        """Write the model's tables of solves and steps, which need no device."""
         cells = ("16", "16") if self.rehearsal else ("128", "64")
         report = subprocess.run(
             [
@@ -356,15 +436,9 @@ class GpuVerdict:
             check=True,
             capture_output=True,
             text=True,
-            timeout=600,
         ).stdout
         (self.out / "model.md").write_text(report)
-        return ", ".join(
-            [
-                *(f"{cells} {ms} ms" for cells, ms, *_ in rows),
-                *(f"a step at {n} {ms} ms, from graphs {graphs}" for n, ms, graphs in steps),
-            ]
-        )
+        return f"from a solve of {cells[0]}^3 cells and steps of {cells[1]} along x"
 
     def _step_time(self, n: int, *, on_device: bool) -> float:
         """Return the time of a dam break step [s], by CUDA graphs or single launches.
@@ -400,12 +474,16 @@ class GpuVerdict:
         rows = [["PASS" if c.holds else "FAIL", c.name, c.found] for c in self.claims]
         tables = [RecordTable("Claims", ["", "claim", "found"], rows), *self.tables]
         record = self.machine
+        order = [claim.name for claim in CLAIMS]
+        rows.sort(key=lambda row: order.index(row[1]))
         lines = [
             f"# Verdict on {self.device}{' (a rehearsal on the CPU)' if self.rehearsal else ''}",
             "",
             f"`{json.dumps(record.facts)}`",
             "",
         ]
+        if self.left_out:
+            lines += [f"Left out, because the time was over: {', '.join(self.left_out)}.", ""]
         for table in tables:
             lines += [f"## {table.title}", "", *markdown(table), ""]
         if (model := self.out / "model.md").exists():
@@ -415,6 +493,7 @@ class GpuVerdict:
             "device": record.facts,
             "claims": [asdict(c) for c in self.claims],
             "tables": [asdict(t) for t in self.tables],
+            "left_out": self.left_out,
         }
         (self.out / "verdict.json").write_text(json.dumps(kept, indent=1))
 
@@ -432,7 +511,7 @@ def launched(graph: wp.Graph | list[wp.Launch]) -> None:
 
 
 def main() -> int:
-    """Run all checks; return 1 if one fails, 2 if there is no device."""
+    """Run all checks; return 1 if one fails or is left out, 2 if there is no device."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -443,6 +522,13 @@ def main() -> int:
     )
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--out", type=Path, default=Path("out/gpu"))
+    parser.add_argument(
+        "--seconds", type=float, default=math.inf, help="time limit; checks are left out after it"
+    )
+    parser.add_argument(
+        "--workers", type=int, help="checks at the same time; by default half of the cores, up to 8"
+    )
+    parser.add_argument("--claim", choices=[c.method for c in CLAIMS], help=argparse.SUPPRESS)
     options = parser.parse_args()
     if not options.rehearse and not wp.is_cuda_available():
         print("no CUDA device: use `--rehearse` for a rehearsal on the CPU", file=sys.stderr)
@@ -453,10 +539,20 @@ def main() -> int:
         rehearsal=options.rehearse,
         out=options.out.resolve(),
     )
-    verdict.all()
+    if options.claim:
+        verdict.check(options.claim)
+        return 0
+    verdict.all(options.workers or default_workers(), options.seconds)
     verdict.write()
     print(f"{options.out}/verdict.md and verdict.json")
-    return int(any(not c.holds for c in verdict.claims))
+    if verdict.left_out:
+        print(f"left out: {', '.join(verdict.left_out)}")
+    return int(bool(verdict.left_out) or any(not c.holds for c in verdict.claims))
+
+
+def default_workers() -> int:
+    """Return half of the cores of this process, 1 to 8."""
+    return min(max(len(os.sched_getaffinity(0)) // 2, 1), 8)
 
 
 if __name__ == "__main__":

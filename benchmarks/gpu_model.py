@@ -80,6 +80,7 @@ CLUSTERS = ("H100 SXM", "H200")  # that have clusters of blocks
 SIZES = (128, 256, 512, 1024)
 STEP_SIZES = (64, 128, 256)
 COUNTED = 64  # cells along x of the largest steps that are counted
+OPTIMIZED = 2  # level of optimization of the CPU's kernels while steps are counted
 # Numbers of cells from which threads take several planes of a row, or blocks of it.
 LARGE = {
     kernel_rows: ("MANY_CELLS", "SUMMED_CELLS", "MANY_CELLS_OF_BLOCKS"),
@@ -569,7 +570,12 @@ def step_of_size(n: int, name: str, counter: LaunchCounter) -> RecordedWork:
 
 
 def print_steps(sizes: Iterable[int]) -> None:
-    """Print what holds a step of the scenes, and a table of its kernels."""
+    """Print what holds a step of the scenes, and a table of its kernels.
+
+    An iteration of the stresses runs hundreds of times before and while it is counted, so the
+    kernels of the CPU are compiled with optimization.
+    """
+    wp.config.optimization_level = OPTIMIZED
     for kind, name in SCENES.items():
         for n in sizes:
             with tempfile.TemporaryDirectory() as folder:

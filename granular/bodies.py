@@ -144,10 +144,11 @@ class SandBodies:
         self.faces = faces
         self._walls, wall_cells = walls, walls.host_cells
         self._entries, cells = entries_near(grid, faces, wall_cells, walls.host_sides)
-        self._entry_cells = wall_cells[self._entries].copy()
 
         def put(values: np.ndarray, dtype: type) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        self._entry_cells = put(wall_cells[self._entries], I32)
 
         for places, part in (
             (self._faces, faces.face),
@@ -178,8 +179,9 @@ class SandBodies:
         velocity: np.ndarray,
         inverse_mass: np.ndarray,
         density: float,
+        dt: float,
     ) -> None:
-        """Start a time step.
+        """Start a time step; the host waits for the device once.
 
         The start velocity is that of the body together with its layer of sand, of mass m and
         momentum p in units of full faces. With w = rho dx^d M^-1 it is (1 + w m)^-1 (V* + w p), and
@@ -193,6 +195,7 @@ class SandBodies:
             velocity: V* of each body, shape (bodies, k) [m/s, 1/s].
             inverse_mass: M^-1 of each, shape (bodies, k, k).
             density: density of sand at its densest packing [kg/m^3].
+            dt: time step [s].
         """
         assert self.faces is not None
         self._scale, rows, owner = (
@@ -200,16 +203,9 @@ class SandBodies:
             self.faces.face.row,
             self.faces.face.body,
         )
-        layer = wp.zeros(len(rows), dtype=wp.vec2d, device=self.grid.device)
-        inputs = [
-            self._faces,
-            flat_vector(packing.mass),
-            flat_vector(sand),
-            flat_vector(weights),
-            layer,
-        ]
-        wp.launch(layer_kernel, len(rows), inputs, device=self.grid.device)
-        mass, speed = layer.numpy().T
+        layer, scales, self._edge_scales, flags = self._read(packing, sand, weights, dt)
+        self._cell_scales = scales.reshape(-1, 2) * self.faces.cell.share[:, None]
+        mass, speed = layer.reshape(-1, 2).T
         mass = mass * within(self.grid, self.faces.face.at, self._own)
         count = len(self.numbers)
         self._layer_mass = self._sum(_products(mass, rows, owner, count))
@@ -226,7 +222,7 @@ class SandBodies:
         self._start.send()
         self._response.send()
         self._beginning.run()
-        held = self._entries[packing.flags.numpy().ravel()[self._entry_cells] != 0]
+        held = self._entries[flags != 0]
         active = np.zeros(1 + len(self._entries), dtype=np.int32)
         active[0], active[1 : 1 + len(held)] = len(held), held
         self._active.assign(active)
@@ -244,9 +240,47 @@ class SandBodies:
                 forget_kernel, len(self._unowned), [self._unowned, *fields], device=self.grid.device
             )
 
-    def prepare(
-        self, packing: Packing, numbers: wp.array, *, pressure_step: float, shear_step: float
-    ) -> None:
+    def _read(
+        self, packing: Packing, sand: Sequence[wp.array], weights: Sequence[wp.array], dt: float
+    ) -> list[np.ndarray]:
+        """Compute and read what the host needs of a packing; see `begin`.
+
+        Returns:
+            Mass and velocity of the sand of each face; inverse step scales of pressure and friction
+            of each cell, and of shear of each edge; flags of the cells of the entries. All are
+            float64 and flat, in one array, so that one copy reads them.
+        """
+        found, device = self.faces, self.grid.device
+        assert found is not None
+        face, cell, edge, entries = found.face, found.cell, found.edge, len(self._entries)
+        sizes = [2 * len(face.at), 2 * len(cell.at), len(edge.at), entries]
+        memory = wp.zeros(sum(sizes), dtype=wp.float64, device=device)
+        begins = np.cumsum([0, *sizes]).tolist()
+        layer, cells, edges, held = (
+            wp.array(ptr=(memory.ptr or 0) + 8 * begin, dtype=dtype, shape=count, device=device)
+            for begin, count, dtype in zip(
+                begins,
+                (len(face.at), len(cell.at), len(edge.at), entries),
+                (wp.vec2d, wp.vec2d, wp.float64, wp.float64),
+                strict=False,
+            )
+        )
+        mass, inverse, flags = (
+            flat_vector(packing.mass),
+            flat_vector(packing.inverse),
+            packing.flags.flatten(),
+        )
+        inputs = [self._faces, mass, flat_vector(sand), flat_vector(weights)]
+        inputs += [self._entry_cells, flags, layer, held]
+        wp.launch(layer_kernel, len(face.at) + entries, inputs, device=device)
+        inputs = [self._shape, self._cells, flags, packing.drive.flatten(), packing.stiff.flatten()]
+        inputs += [mass, inverse, dt / self.grid.spacing, cells]
+        wp.launch(stiffness_kernel, len(cell.at), inputs, device=device)
+        inputs = [self._shape, self._edges, flat_vector(packing.share), inverse, edges]
+        wp.launch(lightness_kernel, len(edge.at), inputs, device=device)
+        return np.split(memory.numpy(), begins[1:-1])
+
+    def prepare(self, *, pressure_step: float, shear_step: float) -> None:
         """Compute the correction of a trial step per velocity mismatch.
 
         The correction is (1 + W G)^-1, where G = R D^-1 R' bounds the change of the force with the
@@ -254,37 +288,13 @@ class SandBodies:
         shear.
 
         Args:
-            packing: the packing of the step.
-            numbers: parameters of the stresses, see `granular.stress_layout`.
             pressure_step: length of the projected gradient step, relative to the diagonal.
             shear_step: likewise for the shear stresses.
         """
-        found, device, dimension = self.faces, self.grid.device, self.grid.dimension
+        found, dimension = self.faces, self.grid.dimension
         assert found is not None
-        inverse, cell, edge = flat_vector(packing.inverse), found.cell, found.edge
-        room = 2 * len(cell.at)  # both are in one buffer, so that one copy reads them
-        memory = wp.zeros(room + len(edge.at), dtype=wp.float64, device=device)
-        cells = wp.array(ptr=memory.ptr or 0, dtype=wp.vec2d, shape=len(cell.at), device=device)
-        inputs = [
-            self._shape,
-            self._cells,
-            packing.flags.flatten(),
-            packing.drive.flatten(),
-            packing.stiff.flatten(),
-        ]
-        wp.launch(
-            stiffness_kernel,
-            len(cell.at),
-            [*inputs, flat_vector(packing.mass), inverse, numbers, cells],
-            device=device,
-        )
-        edges = wp.array(
-            ptr=(memory.ptr or 0) + 8 * room, dtype=wp.float64, shape=len(edge.at), device=device
-        )
-        inputs = [self._shape, self._edges, flat_vector(packing.share), inverse, edges]
-        wp.launch(lightness_kernel, len(edge.at), inputs, device=device)
-        found_cells, found_edges = np.split(memory.numpy(), [room])
-        pressure, shear = (found_cells.reshape(-1, 2) * cell.share[:, None]).T
+        cell, edge = found.cell, found.edge
+        pressure, shear = self._cell_scales.T
         along = cell.row.sum(axis=1)
         if dimension == 2:
             deviator, factor = (cell.row[:, 0] - cell.row[:, 1])[:, None], 1.0
@@ -295,7 +305,7 @@ class SandBodies:
         steepest += _products(factor * shear_step * shear, deviator, cell.body, count)
         own = within(self.grid, edge.at, self._own)
         steepest += _products(
-            shear_step * found_edges * edge.share * own, edge.row, edge.body, count
+            shear_step * self._edge_scales * edge.share * own, edge.row, edge.body, count
         )
         steepest = self._sum(steepest)
         identity = np.eye(self.freedoms)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_lcp.granular.stress_kernels import KERNELS
-from warp_lcp.granular.stress_layout import HOLDS, NEARLY, SHEARS_HERE, STEP_OF_CELL
+from warp_lcp.granular.stress_layout import HOLDS, NEARLY, SHEARS_HERE
 from warp_lcp.kernels import StencilKernel
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.layout import make_struct, put
@@ -216,12 +216,26 @@ def respond_kernel(
 
 
 @forward_kernel(**options)
-def layer_kernel(faces: IncidenceFields, mass: Vector, u: Vector, weight: Vector, out: _PAIRS):
+def layer_kernel(
+    faces: IncidenceFields,
+    mass: Vector,
+    u: Vector,
+    weight: Vector,
+    cells: _INTS,
+    flags: _BYTES,
+    out: _PAIRS,
+    held: _REALS,
+):
     """Compute mass and velocity of the sand that moves with a body's face.
 
-    It is half of the cell in front of the face.
+    It is half of the cell in front of the face. Threads beyond the faces copy the flags of cells,
+    so that the host reads them together with the rest.
     """
     n = wp.tid()
+    count = faces.at.shape[0]
+    if n >= count:
+        held[n - count] = wp.float64(flags[cells[n - count]])
+        return
     a = int(faces.axis[n])
     at = faces.at[n]
     out[n] = wp.vec2d()
@@ -245,18 +259,18 @@ def stiffness_kernel(
     stiff: _SINGLE,
     mass: Vector,
     inverse: Vector,
-    numbers: _SINGLE,
+    step: float,
     out: _PAIRS,
 ):
     """Compute the inverse step scales of pressure and friction in a cell.
 
-    0 where a cell has none.
+    0 where a cell has none. `step` is dt / dx [s/m].
     """
     n = wp.tid()
     at = cells.at[n]
     steps = wp.vec2d()
     if (int(flags[at]) & HOLDS) != 0:
-        full = wp.clamp(1.0 - drive[at] * numbers[STEP_OF_CELL] / NEARLY, 0.0, 1.0)
+        full = wp.clamp(1.0 - drive[at] * step / NEARLY, 0.0, 1.0)
         diagonal = float(0.0)
         for side in range(2):
             for axis in range(grid.dimension):

@@ -443,7 +443,7 @@ class SandSimulation(ParticleSimulation):
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
                 self.sources.impose_velocity(solids.velocity, [])
             packing.update(self.density, self.velocity, dt, solids.velocity)
-            self._begin_bodies()
+            self._begin_bodies(dt)
         if (
             self.grid.device.is_cuda
             and self.flights is not None
@@ -506,7 +506,7 @@ class SandSimulation(ParticleSimulation):
             "staggering_iterations": solved.iterations,
         }
 
-    def _begin_bodies(self) -> None:
+    def _begin_bodies(self, dt: float) -> None:
         """Pass velocity and inverse mass of the bodies to the stress solve."""
         if self.carried is None or self.bodies is None:
             return
@@ -518,6 +518,7 @@ class SandSimulation(ParticleSimulation):
             density=self.scene.physics.density,
             velocity=bodies.velocities() if dimension == 3 else bodies.velocities()[:, PLANAR],
             inverse_mass=bodies.inverse_masses(dimension),
+            dt=dt,
         )
 
     def _push_bodies(self, dt: float) -> None:

@@ -341,9 +341,7 @@ class Stress(wl.VariationalInequality):
         """
         self._host[[PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD]] = pressure_step, shear_step, lookahead
         if self.bodies is not None:
-            self.bodies.prepare(
-                self.packing, self.numbers, pressure_step=pressure_step, shear_step=shear_step
-            )
+            self.bodies.prepare(pressure_step=pressure_step, shear_step=shear_step)
 
     def start_from_now(self) -> None:
         """Reset the momentum to the current stresses; launches or records."""

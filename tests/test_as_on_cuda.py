@@ -318,12 +318,12 @@ def test_the_verdict_on_a_gpu_is_rehearsed(tmp_path: Path) -> None:
         command,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=3600,
         cwd=Path(__file__).parents[1],
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     verdict = json.loads((tmp_path / "verdict.json").read_text())
-    assert len(verdict["claims"]) >= 7
+    assert len(verdict["claims"]) >= 12 and not verdict["left_out"]
     assert all(claim["holds"] for claim in verdict["claims"])
     assert "| PASS | answers equal the CPU's |" in (tmp_path / "verdict.md").read_text()

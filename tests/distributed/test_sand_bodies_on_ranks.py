@@ -10,7 +10,6 @@ from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.subdomain import Subdomain
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
-from warp_lcp.granular.stress_layout import NUMBERS
 from warp_lcp.granular.wall_friction import SandWalls
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import SOLID
@@ -43,13 +42,9 @@ def answers(
         velocity=velocity,
         inverse_mass=inverse,
         density=1.0 / grid.cell_volume,
+        dt=0.5 * grid.spacing,
     )
-    bodies.prepare(
-        packing,
-        wp.array(np.full(NUMBERS, 0.5), dtype=wp.float32),
-        pressure_step=0.8,
-        shear_step=0.4,
-    )
+    bodies.prepare(pressure_step=0.8, shear_step=0.4)
     stress = wp.array(fields["stress"], dtype=wp.float32)
     found = [bodies.velocity.numpy().copy(), bodies._correction.array.numpy().copy()]
     for implicit in (True, False):

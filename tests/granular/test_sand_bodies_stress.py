@@ -51,6 +51,7 @@ class BlocksInSand:
             velocity=velocity,
             inverse_mass=inverse_mass,
             density=DENSITY,
+            dt=DT,
         )
 
     def solve(self, tolerance: float = 1e-3):
