@@ -333,9 +333,8 @@ for (int i = first; i < last; ++i) {
     wetted += (double)(f * sqrtf(ax * ax + ay * ay + az * az));
 }
 
-// kernel fluids.pressure.last_right_side: Right-hand side of the last projection, which corrects a
-// pressure x: b - A x, so that its solution has the bounds of x, and the first guess x. `start` holds
-// A x before
+// kernel fluids.pressure.last_right_side: Right-hand side b - A x of the last projection, which
+// corrects a pressure x, and the first guess x. `start` has A x before
 //   compute    float64
 //   box        float64 b, start, x
 for (int i = first; i < last; ++i) {

@@ -527,9 +527,7 @@ def test_the_last_projection_solves_for_the_sum_of_pressures(seed: int) -> None:
             moved = total[cell] - y / len(neighbors[cell])
             total[cell] = max(moved, 0.0) if at_wall[cell] else moved
 
-    projection.correct(
-        simulation.velocity, simulation.grid.domain, 0.02, 0.02, 1e-9, lambda: None
-    )
+    projection.correct(simulation.velocity, simulation.grid.domain, 0.02, 0.02, 1e-9, lambda: None)
     separated = [cell for cell in cells if at_wall[cell] and total[cell] == 0.0]
     assert 0 < len(separated) < sum(at_wall.values())
     np.testing.assert_allclose(projection.pressure.numpy()[1], total, atol=1e-5)
