@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +26,7 @@ from warp_lcp.grid.staggered import (
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.grid.window_reduction import WindowReduction
 from warp_lcp.kernels import KernelFile, StencilKernel
-from warp_lcp.kernels.launch_graph import LaunchGraph, copy
+from warp_lcp.kernels.launch_graph import LaunchGraph, clear, copy
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import HELD, LETS_GO, RELEASED, TOUCHES
@@ -46,7 +46,8 @@ CONSTANTS = {
 THETA_MIN = 1e-3  # least distance of the air from the center of a FLUID cell [cells]
 KERNELS = KernelFile(Path(__file__).parent / "headers/pressure.h", CONSTANTS)
 COUNT = KERNELS["fluids.pressure.count_fluid"]
-LAST_BOUNDS = KERNELS["fluids.pressure.last_bounds"]
+LAST_RIGHT_SIDE = KERNELS["fluids.pressure.last_right_side"]
+CHANGE = KERNELS["fluids.pressure.change"]
 SUM_PRESSURE = KERNELS["fluids.pressure.sum_pressure"]
 
 
@@ -606,8 +607,12 @@ class PressureProjection:
     ) -> Projection:
         """Project a velocity on which the pressure x has acted already.
 
-        The pressure becomes x plus a correction x', complementary to the outflow with the lower
-        bound `lower - x`, so that the sum keeps its own bound.
+        The pressure becomes x plus a correction x'. With bounds the solve is one for the sum,
+
+            y = A (x + x') + (b - A x),   0 <= x + x' - lower   complementary to   y >= 0,
+
+        because a solve whose bounds have another form than those of the first projection cannot
+        begin from its recorded launches. x is 0 off the FLUID cells.
 
         Args:
             velocity: the velocity [m/s] (updated).
@@ -622,13 +627,20 @@ class PressureProjection:
         before = self._before
         copy(before, self.pressure)
         self.prepare(velocity, dt, kick_dt, window)
-        self._cells.run(LAST_BOUNDS, lower=self._lower, start=self._start, x=before)
-        self._copy_cells()
-        criteria = wl.StoppingCriteria(rtol=0.0, atol=residual, max_iterations=self.max_iterations)
         assert self._problem is not None
+        if self._lower is None:
+            clear(self._start)
+        else:
+            self._problem.A.apply(before, self._start)
+            self._cells.run(LAST_RIGHT_SIDE, b=self._b, start=self._start, x=before)
+        criteria = wl.StoppingCriteria(rtol=0.0, atol=residual, max_iterations=self.max_iterations)
         result = wl.solve(
             self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work
         )
+        if self._lower is not None:
+            self._store_pressure(result.x)
+            self._cells.run(CHANGE, out=self._start, x=self.pressure, before=before, kind=self.kind)
+            result = replace(result, x=self._start)
         self.push_bodies(result)
         moved()
         projected = self.project(velocity, window, result, criteria)

@@ -333,14 +333,20 @@ for (int i = first; i < last; ++i) {
     wetted += (double)(f * sqrtf(ax * ax + ay * ay + az * az));
 }
 
-// kernel fluids.pressure.last_bounds: Lower bound and first guess of the last projection, which
-// corrects a pressure x: lower - x and 0
+// kernel fluids.pressure.last_right_side: Right-hand side b - A x of the last projection, which
+// corrects a pressure x, and the first guess x. `start` has A x before
 //   compute    float64
-//   box        float64 start, lower?, x
+//   box        float64 b, start, x
 for (int i = first; i < last; ++i) {
-    if (lower) lower[i] = lower[i] - x[i];
-    start[i] = 0.0;
+    b[i] -= start[i];
+    start[i] = x[i];
 }
+
+// kernel fluids.pressure.change: Difference of pressures after and before the last projection
+//   compute    float64
+//   box        float64 out, x, before; int8 kind
+//   constants  FLUID
+for (int i = first; i < last; ++i) out[i] = kind[i] == FLUID ? x[i] - before[i] : 0.0;
 
 // kernel fluids.pressure.sum_pressure: Add the pressure before the last projection
 //   compute    float64
