@@ -165,6 +165,9 @@ class Stress(wl.VariationalInequality):
             first two steps.
         checked: velocity under the stresses, in float64, from the last `residual`.
         last_residual: residual of pressure and friction [m/s].
+        mean_stress: root mean square of the stresses in that residual [m/s].
+        velocity_error: estimate of the root mean square error of the velocity under the stresses of
+            that residual [m/s], see `take_residual`.
     """
 
     def __init__(
@@ -218,6 +221,7 @@ class Stress(wl.VariationalInequality):
         self._cells: int | None = 1  # None until it is read after `begin`
         self._yields = [Scalar() for _ in range(NUMBERS - 3)]  # arguments of `numbers_kernel`
         self.last_residual = 0.0, 0.0
+        self.mean_stress, self.velocity_error = 0.0, 0.0
         self.kick_dt, self.cold = 0.0, True
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # before `begin`
         self._ratio = Scalar()  # ratio of this step's `kick_dt` to the last one
@@ -260,7 +264,8 @@ class Stress(wl.VariationalInequality):
         """
         self._last_kick = self.kick_dt
         before = bound.k, bound.cohesion, bound.tension, *map(float, gravity * kick_dt)
-        after = dt / self.packing.grid.spacing, bound.gain, bound.halfway
+        ratio = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
+        after = dt / self.packing.grid.spacing, bound.gain, bound.halfway, ratio
         self._host[:] = *before, 1.0, 1.0, 0.0, *after
         if self.packing.grid.device.is_cuda:
             for number, value in zip(self._yields, (*before, *after), strict=True):
@@ -270,7 +275,7 @@ class Stress(wl.VariationalInequality):
             self.packing.find_ghosts(self.now.shape[0])
             self.counts.fill_(self.cells)
         self.cold = kick_dt > GROWN * self.kick_dt
-        self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
+        self._ratio.value = ratio
         self._admitting.run()
         self.kick_dt = kick_dt
         # Ghost cells without sand have lost their stresses, too.
@@ -420,7 +425,9 @@ class Stress(wl.VariationalInequality):
         """
         self.check().run()
         sums = self.total.numpy()
-        return self.take_residual(sums[0], sums[1] + sums[COLUMNS])
+        return self.take_residual(
+            sums[0], sums[1] + sums[COLUMNS], sums[2], sums[3] + sums[COLUMNS + 3]
+        )
 
     def check(self) -> CommandBuffer:
         """Return the program that writes the sums of the residual to `total`."""
@@ -431,9 +438,33 @@ class Stress(wl.VariationalInequality):
             self._add_up(self._check.launch)
         return self._check
 
-    def take_residual(self, pressure: float, friction: float) -> tuple[float, float]:
-        """Return the residual [m/s] from sums of squares of the device."""
+    def take_residual(
+        self, pressure: float, friction: float, stresses: float, work: float
+    ) -> tuple[float, float]:
+        """Return the residual [m/s] from sums of the device over cells and walls.
+
+        Let y* be the solution, y the stresses with velocity u, and e = y - P(y - D^-1 G(y)). If the
+        bound of the friction is held, the problem is a monotone variational inequality with the
+        matrix A = C M^-1 B, and adding its inequalities at y* and at y - e gives
+
+            |u - u*|_M^2 = |y - y*|_A^2 <= <D e, y - y*> + <A e, y - y*> - <D e, e>.
+
+        So the error of the velocity is of the size of the root of the residual times the error of
+        the stresses. The change of the stresses in the time step stands for the latter:
+
+            velocity_error^2 = sum of D |e| |y - y_past| / cells.
+
+        Against solutions by a Newton method, the error was 0.2 to 1.3 times that.
+
+        Args:
+            pressure: sum of the squared residual of the pressure [m^2/s^2].
+            friction: likewise of the friction.
+            stresses: sum of the squared stresses [m^2/s^2].
+            work: sum of D |e| |y - y_past| [m^2/s^2].
+        """
         self.last_residual = math.sqrt(pressure / self.cells), math.sqrt(friction / self.cells)
+        self.mean_stress = math.sqrt(stresses / self.cells)
+        self.velocity_error = math.sqrt(work / self.cells)
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
@@ -457,7 +488,9 @@ class Stress(wl.VariationalInequality):
 
     @property
     def _fields(self) -> StressFields:
-        return StressFields(self.now, self._before, self._point, self.momentum, self.numbers)
+        return StressFields(
+            self.now, self._before, self._point, self._last, self.momentum, self.numbers
+        )
 
     def _add_up(self, launch: Launch) -> None:
         """Launch the sums over cells and walls of all ranks."""

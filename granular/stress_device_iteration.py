@@ -36,7 +36,7 @@ class StressDeviceIteration:
         self._decisions = DeviceScalar(device, kernels.DECISIONS)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         self._limits = wp.array(method.calm, dtype=wp.float64, device=device)
-        self._scalars = [Scalar() for _ in range(5)]  # arguments of the kernel from `limit_` on
+        self._scalars = [Scalar() for _ in range(6)]  # arguments of the kernel from `limit_` on
         self._beginning, self._resuming = (
             LaunchGraph(device, record)
             for record in (self._launch_beginning, self._launch_resumption)
@@ -62,15 +62,16 @@ class StressDeviceIteration:
         """
         stress, method = self._stress, self._method
         stress.set_steps(*method.steps(stress))
-        limit, least, still = math.inf, method.least, 0.0
+        limit, least, still, unloaded = math.inf, method.least, 0.0, tolerance
         if stress.cold:
-            limit, least, still = (
+            limit, least, still, unloaded = (
                 method.momentum_limit(stress),
                 method.cold,
                 kernels.STILL_SHARE * tolerance,
+                0.0,
             )
         for number, value in zip(
-            self._scalars, (limit, tolerance, least, still, most), strict=True
+            self._scalars, (limit, tolerance, least, still, unloaded, most), strict=True
         ):
             number.value = float(value)
         self._make_loop()

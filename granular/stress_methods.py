@@ -43,6 +43,7 @@ from warp_lcp.settings import (
 # pi / 2 the longest wave, a quarter of which fits into a column's depth, oscillates, and walls hold
 # back what has risen. Friction needs a larger value.
 SWING = 1.9
+SUMS_OF_RESIDUAL = 4  # numbers that the device returns of a residual
 # Distance of the cells of one color along each axis. Two threads then change no common velocity,
 # since an update reaches two cells far.
 APART = 3
@@ -113,7 +114,8 @@ class HeavyBallProjectedGradient(Settings):
         calm: successive limits of the momentum. Above 0.87 deep yielding sand oscillates, which
             doubles its residual; pressure waves as long as the depth of the sand need 0.95 and
             more, so that solves start without a limit.
-        least: minimum number of steps of a solve, unless its residual is nearly zero. Smooth errors
+        least: minimum number of steps of a solve, unless its residual is nearly zero, or the sand
+            falls freely: residual and stresses are within the tolerance. Smooth errors
             hardly show in the residual and accumulate from one time step to the next: without these
             steps, packed sand at rest creeps two to four times as far.
         cold: minimum number for a solve that starts from much smaller stresses than its forces
@@ -214,7 +216,7 @@ class MomentumWorkspace(StressWorkspace):
     def _read_residual(self, place: int) -> float:
         """Read a residual that the device has computed; return its norm."""
         assert self._device_iteration is not None
-        sums = self._device_iteration.decisions()[place : place + 2]
+        sums = self._device_iteration.decisions()[place : place + SUMS_OF_RESIDUAL]
         self.norm, self.current = math.hypot(*self.problem.take_residual(*map(float, sums))), True
         return self.norm
 
@@ -260,10 +262,11 @@ class MomentumWorkspace(StressWorkspace):
         # Counts of steps: done, at the best estimate, at the last change of estimate or momentum.
         self._done, self._best_at, self._moved = 0, 0, 0
         self._least, self._still = method.least, 0.0
+        falls = self.norm <= tolerance and stress.mean_stress < tolerance
         if stress.cold:
-            self._least, self._still = method.cold, STILL_SHARE * tolerance
+            self._least, self._still, falls = method.cold, STILL_SHARE * tolerance, False
             stress.limit_momentum(method.momentum_limit(stress))
-        if self.norm <= NOTHING * tolerance:
+        if falls or self.norm <= NOTHING * tolerance:
             self._least = 0
         return self._least > 0
 

@@ -259,6 +259,7 @@ auto face = [&](int entry, auto from, const float* now, const float* weight, T o
 };
 
 // snippet wall_sums: Sums over entries of walls, behind those of other entries.
-const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, es, ee, ss, 0, residual};
+const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0,        0, RESIDUAL ? work : es, ee,
+                               ss,                      0, residual};
 for (int c = 0; c < COLUMNS; ++c)
     partials[c * (long long)(given.partials.shape[0] / COLUMNS) + behind + c_] = found[c];
