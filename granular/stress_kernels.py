@@ -193,6 +193,9 @@ FIRST, LAST, DECISIONS = 11, 15, 19
 BETTER, NEAR_BEST = 0.95, 1.2
 NOTHING = 1e-3  # relative to the tolerance: nothing to solve
 STILL_SHARE = 1e-2  # relative to the tolerance: sand stays at rest
+# Factor on the first target, if the velocities have a tolerance, too: it may hold before that of the
+# residual.
+EARLY = 4.0
 TIGHTER = 0.8  # factor on the target at each residual, since the estimate may be too low
 # Factor from a step of the friction over its length to its natural residual: measured.
 SHARE = 0.7**0.5
@@ -273,6 +276,7 @@ def begin_steps_kernel(
     still: wp.float64,
     unloaded: wp.float64,
     most: wp.float64,
+    early: wp.float64,
 ):
     """Start the steps of a solve, as `coupled.MomentumWorkspace.start` does.
 
@@ -305,7 +309,7 @@ def begin_steps_kernel(
     decisions[LEAST] = wanted
     decisions[MOST] = most
     decisions[BEST] = wp.float64(wp.inf)
-    decisions[AIM] = tolerance
+    decisions[AIM] = early * tolerance
     decisions[STILL] = still
     decisions[LIMITS] = wp.float64(0.0)
     decisions[DUE] = wp.float64(0.0)

@@ -17,6 +17,7 @@ from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_device_iteration import StressDeviceIteration
 from warp_lcp.granular.stress_kernels import (
     BETTER,
+    EARLY,
     NEAR_BEST,
     NOTHING,
     PERIOD,
@@ -56,6 +57,10 @@ class StressWorkspace(WorkspaceDefaults):
     The last stresses are the result, even if the solve fails; see
     `HeavyBallProjectedGradient.least` for the reason. The problem stores earlier stresses and the
     momentum, which its `begin` uses between solves.
+
+    Attributes:
+        velocity_tolerance: estimated error of the velocities [m/s] at which a solve ends, too; 0
+            if only the residual counts.
     """
 
     precision = wl.Precision.SINGLE
@@ -63,6 +68,7 @@ class StressWorkspace(WorkspaceDefaults):
     def __init__(self, stress: Stress) -> None:
         self.problem, self.x, self.residual = stress, stress.now, self
         self.norm, self.current = math.inf, False
+        self.velocity_tolerance = 0.0
 
     def evaluate(self, x: wp.array) -> float:
         """Return the norm of the natural residual of pressure and friction [m/s].
@@ -188,6 +194,7 @@ class MomentumWorkspace(StressWorkspace):
         # Slot of the decisions with the residual of the current stresses; None if it is unknown.
         self._news: int | None = None
         self._steps_counted = 0  # steps that the outer loop has counted
+        self._least, self._tolerance = 0, 0.0
 
     def begin_on_device(
         self, guess: DeviceArray | None, criteria: wl.StoppingCriteria | MeanCriteria, steps: int
@@ -207,7 +214,7 @@ class MomentumWorkspace(StressWorkspace):
         self._leads = steps > 0 and criteria.rtol == 0.0
         if not self._leads:
             return None
-        self._device_iteration.begin(criteria.atol, steps)
+        self._device_iteration.begin(criteria.atol, steps, early=self._early)
         self._steps_counted = 0
         reference = self._read_residual(kernels.FIRST)
         self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None
@@ -221,8 +228,25 @@ class MomentumWorkspace(StressWorkspace):
         return self.norm
 
     def evaluate(self, x: wp.array) -> float:
-        """Return the norm of the natural residual; see the base class."""
-        return super().evaluate(x) if self._news is None else self._read_residual(self._news)
+        """Return the norm of the natural residual; see the base class.
+
+        After the minimum of steps it is at most the tolerance if the estimated error of the
+        velocities is within its own. Before, that estimate means nothing: it is 0 at the start.
+        `Stress.last_residual` has the residual itself.
+        """
+        norm = super().evaluate(x) if self._news is None else self._read_residual(self._news)
+        stress = self.problem
+        if (
+            stress.steps_taken >= max(self._least, 1)
+            and stress.velocity_error <= self.velocity_tolerance
+        ):
+            self.norm = norm = min(norm, self._tolerance)
+        return norm
+
+    @property
+    def _early(self) -> float:
+        """Factor on the first target of the estimated residual."""
+        return EARLY if self.velocity_tolerance > 0.0 else 1.0
 
     def take_steps(self) -> tuple[int, bool, bool]:
         """Run steps; return their number, and two decisions.
@@ -231,6 +255,7 @@ class MomentumWorkspace(StressWorkspace):
         """
         if self._device_iteration is None or not self._leads:
             steps_taken = self.method.check_every * PERIOD
+            self.problem.steps_taken += steps_taken
             return steps_taken, *self.judge(
                 self.problem.advance(self.method.check_every), steps_taken
             )
@@ -241,6 +266,7 @@ class MomentumWorkspace(StressWorkspace):
             int(found[kernels.DONE]) - self._steps_counted,
             int(found[kernels.DONE]),
         )
+        self.problem.steps_taken += steps_taken
         return steps_taken, bool(found[kernels.DUE]), bool(found[kernels.STAGNATES])
 
     def start(self, *, warm: bool, tolerance: float) -> bool:
@@ -248,8 +274,10 @@ class MomentumWorkspace(StressWorkspace):
 
         The minimum holds for any residual.
         """
+        self._tolerance = tolerance
         if self._device_iteration is not None and self._leads:
-            return bool(self._device_iteration.decisions()[kernels.LEAST] > 0.0)
+            self._least = int(self._device_iteration.decisions()[kernels.LEAST])
+            return self._least > 0
         stress, method = self.problem, self.method
         pressure_step, shear_step, lookahead = method.steps(stress)
         stress.restart(
@@ -258,7 +286,8 @@ class MomentumWorkspace(StressWorkspace):
             lookahead=lookahead,
             momentum=method.momentum,
         )
-        self._aim, self._best, self._limits = tolerance, math.inf, list(method.calm)
+        self._aim, self._best = self._early * tolerance, math.inf
+        self._limits = list(method.calm)
         # Counts of steps: done, at the best estimate, at the last change of estimate or momentum.
         self._done, self._best_at, self._moved = 0, 0, 0
         self._least, self._still = method.least, 0.0

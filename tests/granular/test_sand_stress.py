@@ -350,9 +350,8 @@ def wall_move(
         return 0.0
     x = now[(0, *cell)]
     toward = (1.0 if side else -1.0) * DT * GRAVITY[axis]
-    load = -total_stress(case, axis)[cell] + (0.5 if x > 0.0 else 1.0) * toward * float(
-        p.fraction.numpy()[cell]
-    )
+    half = 0.5 * toward * float(p.fraction.numpy()[cell])
+    load = -total_stress(case, axis)[cell] + half + max(half - max(x, 0.0), 0.0)
     inverse, share = case.field("inverse"), case.field("share")
     point, old, groups, pulls, stiffest = [], [], [], [], 0.0
     for shear, (alpha, beta) in enumerate(AXES[dimension]):
