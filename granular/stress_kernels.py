@@ -34,6 +34,7 @@ from warp_lcp.granular.stress_layout import (
     SHEAR_STEP,
     STEP_OF_CELL,
     TENSION,
+    UNSURE,
     WEIGHT,
 )
 from warp_lcp.kernels import KernelFile, StencilKernel
@@ -216,6 +217,7 @@ def numbers_kernel(
     gain: float,
     halfway: float,
     ratio: float,
+    unsure: float,
 ):
     """Write the parameters of a time step, see `granular.stress_layout`.
 
@@ -234,6 +236,7 @@ def numbers_kernel(
     numbers[GAIN] = gain
     numbers[HALFWAY] = halfway
     numbers[RATIO] = ratio
+    numbers[UNSURE] = unsure
 
 
 @wp.func

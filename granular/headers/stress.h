@@ -93,8 +93,8 @@ for (int d = 0; d < SHEARS; ++d) {
 // x_before). Sums of pressure (0, 1, 2) and of friction (3, 4, 5) in the metric of the diagonal:
 // <e, s>, <e, e>, <s, s> with the error of the projection e = x_new - y and the step s = x_new - x;
 // 6, 7: estimates of the squared natural residuals of both. RESIDUAL: a step of length 1 from the
-// stresses themselves; nothing is changed, and sums 0 and 1 are the squared natural residuals, 2 the
-// squared stresses, and 3 the sum of D |e| |x - x_past| of `Stress.velocity_error`.
+// stresses themselves; nothing is changed. Sums 0 and 1 are the squared natural residuals, 2 the
+// squared stresses, and 3 the work of the error of `Stress.take_residual`.
 // TRIAL: no sums; the new stresses go to `point` alone, which a step no longer needs once the
 // velocity there is known.
 //   compute    float32 | float64
@@ -104,8 +104,8 @@ for (int d = 0; d < SHEARS; ++d) {
 //              edge_x, edge_y?, edge_z?, u_x, u_y?, u_z?
 //   constants  NEWTON, COLUMNS, LEAST_RADIUS, FRICTION, COHESION, TENSION, PRESSURE_STEP,
 //              SHEAR_STEP, LOOKAHEAD, HOLDS, SHEARS_HERE, FIRM, STEP_OF_CELL, NEARLY, GAIN,
-//              HALFWAY, RATIO, DIM, BOX = 0, RATE = 0, CUT = 0, RESIDUAL, TRIAL = 0, NOW_X, NOW_S,
-//              NEXT_X, NEXT_S
+//              HALFWAY, RATIO, UNSURE, DIM, BOX = 0, RATE = 0, CUT = 0, RESIDUAL, TRIAL = 0, NOW_X,
+//              NOW_S, NEXT_X, NEXT_S
 #if !TRIAL
 const long long columns = given.partials.shape[0] / COLUMNS;
 double* partial = partials + (k * (long long)given.flags.shape[1] + j) * L.chunks + c_;
@@ -145,7 +145,7 @@ auto start = [&](int c, long long i, T beta) INLINE {
 };
 T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
 #if RESIDUAL
-const T ratio = (T)numbers[RATIO];
+const T ratio = (T)numbers[RATIO], unsure = (T)numbers[UNSURE];
 T carried = 0, error_work = 0;
 #endif
 MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
@@ -202,7 +202,7 @@ MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
         ss += share_ * s_ * s_;
 #if RESIDUAL
         carried += share_ * (T)old * (T)old;
-        work += share_ * magnitude(s_ * ((T)old - ratio * (T)past[at]));
+        work += share_ * magnitude(s_) * (magnitude((T)old - ratio * (T)past[at]) + unsure);
 #endif
         if (TRIAL)
             point[at] = held ? ahead_of : (float)value;
@@ -273,7 +273,7 @@ for (int c = 0; c < COLUMNS; ++c) partial[c * columns] = found[c];
 //   box        int32 active
 //   numbers    int behind
 //   constants  NEWTON, COLUMNS, LEAST_RADIUS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD,
-//              GAIN, RATIO, DIM, BOX = 0, RESIDUAL, TRIAL = 0, NOW_S, NEXT_S
+//              GAIN, RATIO, UNSURE, DIM, BOX = 0, RESIDUAL, TRIAL = 0, NOW_S, NEXT_S
 #include "sand.h:shape"
 #include "sand.h:wall_face"
 #include "sand.h:light"
@@ -302,8 +302,8 @@ for (int m = first; m < end; ++m) {
             ss += 0.5 * stiff * s_ * s_;
             residual += 0.5 * (RESIDUAL ? s_ * s_ : e_ * e_);
 #if RESIDUAL
-            const T error = s_ * (old - (T)numbers[RATIO] * (T)past[slot]);
-            work += 0.5 * stiff * (error < (T)0 ? -error : error);
+            const T change = old - (T)numbers[RATIO] * (T)past[slot];
+            work += 0.5 * stiff * fabs(s_) * (fabs(change) + (T)numbers[UNSURE]);
 #endif
             if (!RESIDUAL) {
                 before[slot] = (float)old;
@@ -339,8 +339,8 @@ for (int m = first; m < end; ++m) {
 //              momentum; float32 numbers; float64 partials
 //   box        int32 cells, numbers_of
 //   numbers    int behind
-//   constants  COLUMNS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD, HOLDS, GAIN, RATIO, DIM,
-//              BOX = 0, RESIDUAL, NOW_S, NEXT_S
+//   constants  COLUMNS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD, HOLDS, GAIN, RATIO,
+//              UNSURE, DIM, BOX = 0, RESIDUAL, NOW_S, NEXT_S
 #include "sand.h:shape"
 #include "sand.h:wall_bound"
 const float* inverse[3] = XYZ(inverse);
@@ -395,8 +395,8 @@ for (int m = first; m < last; ++m) {
         ss += stiffest * s_ * s_;
         residual += RESIDUAL ? s_ * s_ : e_ * e_;
 #if RESIDUAL
-        const T error = s_ * (old - (T)numbers[RATIO] * (T)past[at]) / scale;
-        work += stiffest * (error < (T)0 ? -error : error);
+        const T change = (old - (T)numbers[RATIO] * (T)past[at]) / scale;
+        work += stiffest * fabs(s_) * (fabs(change) + (T)numbers[UNSURE]);
 #endif
         if (!RESIDUAL) {
             before[at] = (float)old;

@@ -233,3 +233,16 @@ def test_the_plan_lists_material_and_friction() -> None:
     assert plan["material"].startswith("dry-sand, friction angle 30 degrees")
     assert plan["friction"] == "cone, on walls 0.577"
     assert plan["solver"].startswith("accelerated-projection to 0.001")
+
+
+def test_velocities_have_a_tolerance_that_follows_from_that_of_the_residual() -> None:
+    sand = [box([0.0, 0.0], [0.5, 0.25])]
+
+    def allowed(**solver: float) -> float:
+        model = scene(size=[1.0, 0.5], resolution=16, sand=sand, solver=solver)
+        return model.solver.allowed_velocity_error
+
+    assert allowed() == pytest.approx(0.05)
+    assert allowed(tolerance=1e-4) == pytest.approx(0.005)
+    assert allowed(velocity_tolerance=0.02) == 0.02
+    assert allowed(velocity_tolerance=0.0) == 0.0

@@ -501,6 +501,23 @@ def test_the_residual_is_how_far_the_projection_moves_the_stress(
     assert friction == pytest.approx(np.sqrt((moves[:, 1].sum() + rubs) / len(cells)), rel=1e-3)
 
 
+@pytest.mark.parametrize(("dimension", "seed"), CASES)
+def test_the_load_of_walls_is_continuous_in_the_pressure(dimension: int, seed: int) -> None:
+    """Load of a wall as the pressure of its cell goes to 0.
+
+    Half of the weight of all cells without pressure appeared there before.
+    """
+    case = make(dimension, seed)
+    frictions = []
+    for pressure in (0.0, 1e-7):
+        stress = np.zeros(case.stress.now.shape, dtype=np.float32)
+        stress[0] = pressure * (case.packing.flags.numpy() > 0)
+        case.stress.now.assign(stress)
+        frictions.append(case.stress.residual()[1])
+    assert frictions[0] > 0.0
+    assert frictions[1] == pytest.approx(frictions[0], abs=1e-5)
+
+
 @pytest.mark.parametrize("dimension", [2, 3])
 def test_a_stress_free_fall_has_no_residual(dimension: int) -> None:
     """Free fall without stress and without residual: loose sand bears nothing."""
