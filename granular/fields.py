@@ -82,6 +82,7 @@ class StressFields:
         now: the current stresses.
         before: the stresses before the last step.
         point: the point at which the next gradient is taken.
+        past: the stresses of the last time step.
         momentum: momentum of the next steps, float64.
         numbers: parameters, float32, see `granular.stress_layout`.
     """
@@ -89,6 +90,7 @@ class StressFields:
     now: wp.array
     before: wp.array
     point: wp.array
+    past: wp.array
     momentum: wp.array
     numbers: wp.array
 

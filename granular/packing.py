@@ -176,7 +176,7 @@ class Packing:
         """Launch an update.
 
         Each kernel needs the result of the one before: fractions of cells; kinds, flags and free
-        volumes; masses of faces; weights of edges; stiffness of cells; spans of the rows.
+        volumes; masses of faces; fronts; weights of edges; stiffness of cells; spans of the rows.
         """
         grid, dimension = self.grid, self.grid.dimension
         domain, nodes = grid.domain, self.nodes
@@ -215,6 +215,13 @@ class Packing:
             nodes.launch(kernels.face_kernel, [axis, self.base, self.fraction, *fields])
             if self.sides is not None:
                 self.sides.wrap(self.start[axis], self.mass[axis], self.inverse[axis])
+        mass, start, inverse = (
+            put(kernels.Faces(), dict(zip("xyz", fields, strict=False)))
+            for fields in (self.mass, self.start, self.inverse)
+        )
+        domain.launch(
+            kernels.front_kernel, [dimension, self._rate, openings, mass, start, self.drive]
+        )
         for (alpha, beta), part, share in zip(SHEARS[dimension], around, self.share, strict=False):
             nodes.launch(
                 kernels.edge_kernel,
@@ -229,12 +236,9 @@ class Packing:
                     share,
                 ],
             )
-        inverse, share = (
-            put(kernels.Faces(), dict(zip("xyz", fields, strict=False)))
-            for fields in (self.inverse, self.share)
-        )
+        shares = put(kernels.Faces(), dict(zip("xyz", self.share, strict=False)))
         domain.launch(
-            kernels.stiffness_kernel, [dimension, self.flags, inverse, share, openings, self.stiff]
+            kernels.stiffness_kernel, [dimension, self.flags, inverse, shares, openings, self.stiff]
         )
         self._launch_counts(density)
         if self.sides is not None:

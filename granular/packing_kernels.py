@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.granular.stress_layout import FIRM, HOLDS, PARTLY, SHEARS_HERE
+from warp_lcp.granular.stress_layout import FIRM, HOLDS, NEARLY, PARTLY, SHEARS_HERE
 from warp_lcp.grid.cell_kernel import F32, F64, I8, I32, U8, cell_below, cell_kernel, list_kernel
 from warp_lcp.kernels.layout import make_struct
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
@@ -198,6 +198,48 @@ def face_kernel(
     mass[k, j, i] = m
     inverse[k, j, i] = light
     start[k, j, i] = u
+
+
+@cell_kernel("granular.packing")
+def front_kernel(
+    k, j, i, dimension: int, rate: float, openings: _F32X, mass: Faces, start: Faces, drive: F32
+):
+    """Close cells that only the mass flux of translating sand would compress.
+
+    Where a front of sand moves through a cell, its profile is smooth over two cells, and the flux
+    of its mass through the faces, a central difference, fills the cell beyond its free volume
+    although nothing is compressed. Such a cell counts as full: only its volume is kept then.
+    """
+    # w = drive + div(m' u) as in the snippet `divergence` of `sand.h`, at the velocity u before the
+    # stresses, and div u; both times dx [m/s]. With drive = 0 the first becomes the second.
+    free = drive[k, j, i]
+    full = wp.clamp(1.0 - free / (rate * NEARLY), 0.0, 1.0)
+    w = free
+    volume = float(0.0)
+    for axis in range(dimension):
+        n = k + wp.where(axis == 2, 1, 0)
+        m = j + wp.where(axis == 1, 1, 0)
+        l = i + wp.where(axis == 0, 1, 0)
+        low, high = _component(start, axis, k, j, i), _component(start, axis, n, m, l)
+        below, above = _component(mass, axis, k, j, i), _component(mass, axis, n, m, l)
+        if openings:
+            low = low * openings[axis, k, j, i]
+            high = high * openings[axis, n, m, l]
+        w += (above + full * (1.0 - above)) * high - (below + full * (1.0 - below)) * low
+        volume += high - low
+    if free > 0.0 and w < wp.min(volume, 0.0):
+        drive[k, j, i] = 0.0
+
+
+@wp.func
+def _component(faces: Faces, axis: int, k: int, j: int, i: int):
+    """Return the value of a component on a cell's lower face."""
+    value = faces.x[k, j, i]
+    if axis == 1:
+        value = faces.y[k, j, i]
+    if axis == 2:
+        value = faces.z[k, j, i]
+    return value
 
 
 @cell_kernel("granular.packing")

@@ -34,6 +34,8 @@ STEEPEST_ANGLE = {  # degrees
     "triaxial-compression": {3: 36.8},
 }
 FRICTION_ANGLE = UsualRange(6.0, 60.0, "degrees", "25 to 45", "radians", math.degrees(1.0))
+# Estimated error of the velocities [g dt] at which a solve ends, relative to its tolerance.
+VELOCITY_SHARE = 50.0
 COHESION = UsualRange(0.0, 1e6, "Pa", "100 to 5,000 (damp sand), 1e4 to 1e5 (clay)")
 SAND_CFL = UsualRange(0.0, 4.0, "", "0.5 to 1")
 # Inertial number at which friction of glass beads has reached half of its growth
@@ -166,12 +168,23 @@ class SandSolver(Table):
     tolerance: Annotated[Share, BeforeValidator(_not_automatic)] = Field(
         default=1e-3, description="root mean square residual [rho g dx]"
     )
+    velocity_tolerance: NonNegative | None = Field(
+        default=None,
+        description="a solve also ends where the estimated error of the velocities is at most this "
+        "[g dt]; default: 50 tolerance; 0: only the residual counts",
+    )
     max_iterations: int = Field(
         default=600, ge=10, description="after these the step accepts the stresses"
     )
     precision: Literal["single"] = Field(
         default="single", description="of the stresses; residuals are double"
     )
+
+    @property
+    def allowed_velocity_error(self) -> float:
+        """Return the tolerance of the velocities [g dt], 0 if only the residual counts."""
+        given = self.velocity_tolerance
+        return VELOCITY_SHARE * self.tolerance if given is None else given
 
 
 class SandProperties(MaterialProperties):

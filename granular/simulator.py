@@ -69,6 +69,7 @@ STANDING = 0.05  # of sqrt(g dx): velocity scale of the residual without gravity
 DIAGNOSTICS = ("yielded", "dissipation", "predicted_excess", "front")  # columns for the log only
 COLUMNS = (
     "coupled_residual",
+    "velocity_error",
     "staggering_iterations",
     *DIAGNOSTICS,
     "max_fraction",
@@ -270,7 +271,8 @@ class SandSimulation(ParticleSimulation):
         """Return the log columns of stresses and shape of the sand.
 
         coupled_residual: natural residual of pressure and friction together, root mean square over
-        the cells with sand, in units of rho g dx; solve_residual: relative to that at the start of
+        the cells with sand, in units of rho g dx; velocity_error: estimate of the velocity's root
+        mean square error, in units of g dt, see `Stress.take_residual`; solve_residual: relative to that at the start of
         the solve; staggering_iterations: iterations of the coupled method; yielded, dissipation,
         predicted_excess: see `SandReport.report`; front [m]: x up to which the deposit is connected
         at the start of the step, see `deposit_front`; max_fraction: largest fraction of a cell at
@@ -422,6 +424,8 @@ class SandSimulation(ParticleSimulation):
         # The first solve on a grid, or the method has changed.
         if self._made_by is not self.method:
             self._work, self._made_by = self.method.init(self.stress), self.method
+        assert self._work is not None
+        self._work.velocity_tolerance = solver.allowed_velocity_error * scale
         return wl.solve(
             self.stress, self.method, stopping=stopping, workspace=cast(Workspace, self._work)
         )
@@ -503,6 +507,7 @@ class SandSimulation(ParticleSimulation):
             "solve_iterations": solved.iterations,
             "solve_residual": residual / first if first > 0.0 else 0.0,
             "coupled_residual": residual,
+            "velocity_error": stress.velocity_error / scale,
             "staggering_iterations": solved.iterations,
         }
 

@@ -44,6 +44,8 @@ from warp_lcp.kernels.vectors import Reduction, sum_over_ranks
 from warp_lcp.settings import renamed_method
 
 WALL_GRAIN = 256  # wall faces per CPU thread
+# Estimate of the velocity's error: factor, and least error of the stresses [rho g dx].
+ERROR_SHARE, UNSURE_WEIGHTS = 0.5, 0.5
 MOST_MOMENTUM = 0.985  # default limit of the momentum
 GROWN = 1.5  # if forces act longer than this times the last step, old stresses are no good guess
 
@@ -165,6 +167,10 @@ class Stress(wl.VariationalInequality):
             first two steps.
         checked: velocity under the stresses, in float64, from the last `residual`.
         last_residual: residual of pressure and friction [m/s].
+        mean_stress: root mean square of the stresses in that residual [m/s].
+        velocity_error: estimate of the root mean square error of the velocity under the stresses of
+            that residual [m/s], see `take_residual`.
+        steps_taken: steps with momentum since `begin`.
     """
 
     def __init__(
@@ -218,6 +224,7 @@ class Stress(wl.VariationalInequality):
         self._cells: int | None = 1  # None until it is read after `begin`
         self._yields = [Scalar() for _ in range(NUMBERS - 3)]  # arguments of `numbers_kernel`
         self.last_residual = 0.0, 0.0
+        self.mean_stress, self.velocity_error, self.steps_taken = 0.0, 0.0, 0
         self.kick_dt, self.cold = 0.0, True
         self._last, self._last_kick = wp.zeros_like(self.now), 0.0  # before `begin`
         self._ratio = Scalar()  # ratio of this step's `kick_dt` to the last one
@@ -258,9 +265,11 @@ class Stress(wl.VariationalInequality):
             kick_dt: time that forces act in the step [s]; stresses are impulses and are rescaled
                 from the last step's pressure.
         """
-        self._last_kick = self.kick_dt
+        self._last_kick, self.steps_taken = self.kick_dt, 0
         before = bound.k, bound.cohesion, bound.tension, *map(float, gravity * kick_dt)
-        after = dt / self.packing.grid.spacing, bound.gain, bound.halfway
+        ratio = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
+        unsure = UNSURE_WEIGHTS * float(np.linalg.norm(gravity)) * kick_dt
+        after = dt / self.packing.grid.spacing, bound.gain, bound.halfway, ratio, unsure
         self._host[:] = *before, 1.0, 1.0, 0.0, *after
         if self.packing.grid.device.is_cuda:
             for number, value in zip(self._yields, (*before, *after), strict=True):
@@ -270,7 +279,7 @@ class Stress(wl.VariationalInequality):
             self.packing.find_ghosts(self.now.shape[0])
             self.counts.fill_(self.cells)
         self.cold = kick_dt > GROWN * self.kick_dt
-        self._ratio.value = kick_dt / self.kick_dt if self.kick_dt > 0.0 else 1.0
+        self._ratio.value = ratio
         self._admitting.run()
         self.kick_dt = kick_dt
         # Ghost cells without sand have lost their stresses, too.
@@ -418,7 +427,9 @@ class Stress(wl.VariationalInequality):
         """
         self.check().run()
         sums = self.total.numpy()
-        return self.take_residual(sums[0], sums[1] + sums[COLUMNS])
+        return self.take_residual(
+            sums[0], sums[1] + sums[COLUMNS], sums[2], sums[3] + sums[COLUMNS + 3]
+        )
 
     def check(self) -> CommandBuffer:
         """Return the program that writes the sums of the residual to `total`."""
@@ -429,9 +440,37 @@ class Stress(wl.VariationalInequality):
             self._add_up(self._check.launch)
         return self._check
 
-    def take_residual(self, pressure: float, friction: float) -> tuple[float, float]:
-        """Return the residual [m/s] from sums of squares of the device."""
+    def take_residual(
+        self, pressure: float, friction: float, stresses: float, work: float
+    ) -> tuple[float, float]:
+        """Return the residual [m/s] from sums of the device over cells and walls.
+
+        Let y* be the solution, y the stresses with velocity u, and e = y - P(y - D^-1 G(y)). If the
+        bound of the friction is held, the problem is a monotone variational inequality with the
+        matrix A = C M^-1 B, and adding its inequalities at y* and at y - e gives
+
+            |u - u*|_M^2 = |y - y*|_A^2 <= <D e, y - y*> + <A e, y - y*> - <D e, e>.
+
+        So the error of the velocity is of the size of the root of the residual times the error of
+        the stresses. The latter is taken to be the change of the stresses in the time step plus
+        half of the weight of a cell, since an error may persist from step to step:
+
+            velocity_error = ERROR_SHARE sqrt(sum of D |e| (|y - y_past| + unsure) / cells).
+
+        This is calibrated against 49 solutions by a proximal Newton method, of 2-D collapses,
+        silos and bins: the error, with the masses of the faces as weights, was 0.24 to 1.9 times
+        the estimate. Of 39 with an estimate of at most 0.05 g dt 38 had such an error, and one
+        0.052.
+
+        Args:
+            pressure: sum of the squared residual of the pressure [m^2/s^2].
+            friction: likewise of the friction.
+            stresses: sum of the squared stresses [m^2/s^2].
+            work: sum of D |e| (|y - y_past| + unsure) [m^2/s^2].
+        """
         self.last_residual = math.sqrt(pressure / self.cells), math.sqrt(friction / self.cells)
+        self.mean_stress = math.sqrt(stresses / self.cells)
+        self.velocity_error = ERROR_SHARE * math.sqrt(work / self.cells)
         return self.last_residual
 
     def _project(self, velocity: Velocity, launch: Launch) -> None:
@@ -455,7 +494,9 @@ class Stress(wl.VariationalInequality):
 
     @property
     def _fields(self) -> StressFields:
-        return StressFields(self.now, self._before, self._point, self.momentum, self.numbers)
+        return StressFields(
+            self.now, self._before, self._point, self._last, self.momentum, self.numbers
+        )
 
     def _add_up(self, launch: Launch) -> None:
         """Launch the sums over cells and walls of all ranks."""

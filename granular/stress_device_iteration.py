@@ -36,7 +36,7 @@ class StressDeviceIteration:
         self._decisions = DeviceScalar(device, kernels.DECISIONS)
         self._going = wp.zeros(1, dtype=wp.int32, device=device)
         self._limits = wp.array(method.calm, dtype=wp.float64, device=device)
-        self._scalars = [Scalar() for _ in range(5)]  # arguments of the kernel from `limit_` on
+        self._scalars = [Scalar() for _ in range(7)]  # arguments of the kernel from `limit_` on
         self._beginning, self._resuming = (
             LaunchGraph(device, record)
             for record in (self._launch_beginning, self._launch_resumption)
@@ -53,24 +53,26 @@ class StressDeviceIteration:
         grid = stress.packing.grid
         return loops_on_device(grid.device) and not (stress.shared and grid.device.is_cuda)
 
-    def begin(self, tolerance: float, most: int) -> None:
+    def begin(self, tolerance: float, most: int, *, early: float = 1.0) -> None:
         """Evaluate the residual of the current stresses, and run steps until it is due.
 
         Args:
             tolerance: tolerance of the residual [m/s].
             most: most steps of the solve.
+            early: factor on the first target of the estimate.
         """
         stress, method = self._stress, self._method
         stress.set_steps(*method.steps(stress))
-        limit, least, still = math.inf, method.least, 0.0
+        limit, least, still, unloaded = math.inf, method.least, 0.0, tolerance
         if stress.cold:
-            limit, least, still = (
+            limit, least, still, unloaded = (
                 method.momentum_limit(stress),
                 method.cold,
                 kernels.STILL_SHARE * tolerance,
+                0.0,
             )
         for number, value in zip(
-            self._scalars, (limit, tolerance, least, still, most), strict=True
+            self._scalars, (limit, tolerance, least, still, unloaded, most, early), strict=True
         ):
             number.value = float(value)
         self._make_loop()

@@ -30,9 +30,11 @@ from warp_lcp.granular.stress_layout import (
     HALFWAY,
     LOOKAHEAD,
     PRESSURE_STEP,
+    RATIO,
     SHEAR_STEP,
     STEP_OF_CELL,
     TENSION,
+    UNSURE,
     WEIGHT,
 )
 from warp_lcp.kernels import KernelFile, StencilKernel
@@ -185,12 +187,16 @@ DONE, BEST_AT, CHANGED, LEAST, MOST = 0, 1, 2, 3, 4
 BEST, AIM, STILL = 5, 6, 7
 # Number of momentum limits used; whether the residual is due; whether progress has ended.
 LIMITS, DUE, STAGNATES = 8, 9, 10
-# Sums of squares of the residuals of pressure and friction: at the start, after the last steps.
-FIRST, LAST, DECISIONS = 11, 13, 15
+# Sums of a residual (squares of the pressure's and the friction's, squares of the stresses, work of
+# the error) at the start and after the last steps.
+FIRST, LAST, DECISIONS = 11, 15, 19
 # Factors on the best estimate: less is progress; a stagnating solve ends within the second one.
 BETTER, NEAR_BEST = 0.95, 1.2
-NOTHING = 1e-3  # relative to the tolerance: nothing to solve, as in free fall
+NOTHING = 1e-3  # relative to the tolerance: nothing to solve
 STILL_SHARE = 1e-2  # relative to the tolerance: sand stays at rest
+# Factor on the first target, if the velocities have a tolerance, too: it may hold before that of the
+# residual.
+EARLY = 4.0
 TIGHTER = 0.8  # factor on the target at each residual, since the estimate may be too low
 # Factor from a step of the friction over its length to its natural residual: measured.
 SHARE = 0.7**0.5
@@ -210,6 +216,8 @@ def numbers_kernel(
     step: float,
     gain: float,
     halfway: float,
+    ratio: float,
+    unsure: float,
 ):
     """Write the parameters of a time step, see `granular.stress_layout`.
 
@@ -227,6 +235,8 @@ def numbers_kernel(
     numbers[STEP_OF_CELL] = step
     numbers[GAIN] = gain
     numbers[HALFWAY] = halfway
+    numbers[RATIO] = ratio
+    numbers[UNSURE] = unsure
 
 
 @wp.func
@@ -239,13 +249,16 @@ def limit(state: f64s, momentum: wp.float64):
 
 @forward_kernel(module="granular.momentum")
 def keep_sums_kernel(sums: f64s, decisions: f64s, place: int):
-    """Store the sums of a residual: of pressure, of friction in cells and on walls."""
+    """Store the sums of a residual: of pressure, friction, stresses, and work of the error."""
     decisions[place] = sums[0]
     decisions[place + 1] = sums[1] + sums[COLUMNS]
+    decisions[place + 2] = sums[2]
+    decisions[place + 3] = sums[3] + sums[COLUMNS + 3]
 
 
 # The norm of the residual is sqrt((pressure + friction) / cells) [m/s], with sums of squares over
-# cells and walls. No minimum of steps is due below NOTHING * tolerance. Steps run if a minimum is
+# cells and walls. No minimum of steps is due if it is below NOTHING * tolerance, or within
+# the tolerance with stresses whose root mean square is below `unloaded`. Steps run if a minimum is
 # due or norm > tolerance (1 + 1e-9).
 @forward_kernel(module="granular.momentum")
 def begin_steps_kernel(
@@ -264,7 +277,9 @@ def begin_steps_kernel(
     tolerance: wp.float64,
     least: wp.float64,
     still: wp.float64,
+    unloaded: wp.float64,
     most: wp.float64,
+    early: wp.float64,
 ):
     """Start the steps of a solve, as `coupled.MomentumWorkspace.start` does.
 
@@ -283,9 +298,13 @@ def begin_steps_kernel(
         limit(state, limit_)
     decisions[FIRST] = sums[0]
     decisions[FIRST + 1] = sums[1] + sums[COLUMNS]
-    norm = wp.sqrt((decisions[FIRST] + decisions[FIRST + 1]) / wp.max(counted[0], wp.float64(1.0)))
+    decisions[FIRST + 2] = sums[2]
+    decisions[FIRST + 3] = sums[3] + sums[COLUMNS + 3]
+    cells = wp.max(counted[0], wp.float64(1.0))
+    norm = wp.sqrt((decisions[FIRST] + decisions[FIRST + 1]) / cells)
+    falls = norm <= tolerance and wp.sqrt(sums[2] / cells) < unloaded
     wanted = least
-    if norm <= wp.float64(NOTHING) * tolerance:
+    if falls or norm <= wp.float64(NOTHING) * tolerance:
         wanted = wp.float64(0.0)
     decisions[DONE] = wp.float64(0.0)
     decisions[BEST_AT] = wp.float64(0.0)
@@ -293,7 +312,7 @@ def begin_steps_kernel(
     decisions[LEAST] = wanted
     decisions[MOST] = most
     decisions[BEST] = wp.float64(wp.inf)
-    decisions[AIM] = tolerance
+    decisions[AIM] = early * tolerance
     decisions[STILL] = still
     decisions[LIMITS] = wp.float64(0.0)
     decisions[DUE] = wp.float64(0.0)

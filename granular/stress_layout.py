@@ -24,7 +24,8 @@ COLUMNS = 8  # columns of the sums of a row, see `granular.stress_kernels`
 # Slots of the kernels' parameters: yield set; dt g [m/s] (three entries); steps of the method
 # relative to the diagonal; point of the gradient beyond the stresses, in units of the momentum's
 # displacement; dt / dx [s/m]; growth of friction with the shear rate (snippet `rate_bound` of
-# `sand.h`).
+# `sand.h`); factor from the stresses of the last time step to those that this one starts from;
+# least error of a stress [m/s] in the estimate of the velocity's error.
 FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_OF_CELL = (
     0,
     1,
@@ -35,7 +36,7 @@ FRICTION, COHESION, TENSION, WEIGHT, PRESSURE_STEP, SHEAR_STEP, LOOKAHEAD, STEP_
     8,
     9,
 )
-GAIN, HALFWAY, NUMBERS = 10, 11, 12
+GAIN, HALFWAY, RATIO, UNSURE, NUMBERS = 10, 11, 12, 13, 14
 
 HOLDS = 1  # bits of a cell: it holds sand, and so has a pressure,
 SHEARS_HERE = 2  # it holds enough sand for shear stress,
@@ -65,6 +66,8 @@ CONSTANTS = {
     "NEARLY": NEARLY,
     "GAIN": GAIN,
     "HALFWAY": HALFWAY,
+    "RATIO": RATIO,
+    "UNSURE": UNSURE,
 }
 
 F64, U8, I32 = wp.float64, wp.uint8, wp.int32

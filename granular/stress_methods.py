@@ -17,6 +17,7 @@ from warp_lcp.granular.stress import Stress
 from warp_lcp.granular.stress_device_iteration import StressDeviceIteration
 from warp_lcp.granular.stress_kernels import (
     BETTER,
+    EARLY,
     NEAR_BEST,
     NOTHING,
     PERIOD,
@@ -43,6 +44,7 @@ from warp_lcp.settings import (
 # pi / 2 the longest wave, a quarter of which fits into a column's depth, oscillates, and walls hold
 # back what has risen. Friction needs a larger value.
 SWING = 1.9
+SUMS_OF_RESIDUAL = 4  # numbers that the device returns of a residual
 # Distance of the cells of one color along each axis. Two threads then change no common velocity,
 # since an update reaches two cells far.
 APART = 3
@@ -55,6 +57,10 @@ class StressWorkspace(WorkspaceDefaults):
     The last stresses are the result, even if the solve fails; see
     `HeavyBallProjectedGradient.least` for the reason. The problem stores earlier stresses and the
     momentum, which its `begin` uses between solves.
+
+    Attributes:
+        velocity_tolerance: estimated error of the velocities [m/s] at which a solve ends, too; 0
+            if only the residual counts.
     """
 
     precision = wl.Precision.SINGLE
@@ -62,6 +68,7 @@ class StressWorkspace(WorkspaceDefaults):
     def __init__(self, stress: Stress) -> None:
         self.problem, self.x, self.residual = stress, stress.now, self
         self.norm, self.current = math.inf, False
+        self.velocity_tolerance = 0.0
 
     def evaluate(self, x: wp.array) -> float:
         """Return the norm of the natural residual of pressure and friction [m/s].
@@ -113,7 +120,8 @@ class HeavyBallProjectedGradient(Settings):
         calm: successive limits of the momentum. Above 0.87 deep yielding sand oscillates, which
             doubles its residual; pressure waves as long as the depth of the sand need 0.95 and
             more, so that solves start without a limit.
-        least: minimum number of steps of a solve, unless its residual is nearly zero. Smooth errors
+        least: minimum number of steps of a solve, unless its residual is nearly zero, or the sand
+            falls freely: residual and stresses are within the tolerance. Smooth errors
             hardly show in the residual and accumulate from one time step to the next: without these
             steps, packed sand at rest creeps two to four times as far.
         cold: minimum number for a solve that starts from much smaller stresses than its forces
@@ -186,6 +194,7 @@ class MomentumWorkspace(StressWorkspace):
         # Slot of the decisions with the residual of the current stresses; None if it is unknown.
         self._news: int | None = None
         self._steps_counted = 0  # steps that the outer loop has counted
+        self._least, self._tolerance = 0, 0.0
 
     def begin_on_device(
         self, guess: DeviceArray | None, criteria: wl.StoppingCriteria | MeanCriteria, steps: int
@@ -205,7 +214,7 @@ class MomentumWorkspace(StressWorkspace):
         self._leads = steps > 0 and criteria.rtol == 0.0
         if not self._leads:
             return None
-        self._device_iteration.begin(criteria.atol, steps)
+        self._device_iteration.begin(criteria.atol, steps, early=self._early)
         self._steps_counted = 0
         reference = self._read_residual(kernels.FIRST)
         self._news = kernels.LAST if self.problem.packing.grid.device.is_cuda else None
@@ -214,13 +223,30 @@ class MomentumWorkspace(StressWorkspace):
     def _read_residual(self, place: int) -> float:
         """Read a residual that the device has computed; return its norm."""
         assert self._device_iteration is not None
-        sums = self._device_iteration.decisions()[place : place + 2]
+        sums = self._device_iteration.decisions()[place : place + SUMS_OF_RESIDUAL]
         self.norm, self.current = math.hypot(*self.problem.take_residual(*map(float, sums))), True
         return self.norm
 
     def evaluate(self, x: wp.array) -> float:
-        """Return the norm of the natural residual; see the base class."""
-        return super().evaluate(x) if self._news is None else self._read_residual(self._news)
+        """Return the norm of the natural residual; see the base class.
+
+        After the minimum of steps it is at most the tolerance if the estimated error of the
+        velocities is within its own. Before, that estimate means nothing: it is 0 at the start.
+        `Stress.last_residual` has the residual itself.
+        """
+        norm = super().evaluate(x) if self._news is None else self._read_residual(self._news)
+        stress = self.problem
+        if (
+            stress.steps_taken >= max(self._least, 1)
+            and stress.velocity_error <= self.velocity_tolerance
+        ):
+            self.norm = norm = min(norm, self._tolerance)
+        return norm
+
+    @property
+    def _early(self) -> float:
+        """Factor on the first target of the estimated residual."""
+        return EARLY if self.velocity_tolerance > 0.0 else 1.0
 
     def take_steps(self) -> tuple[int, bool, bool]:
         """Run steps; return their number, and two decisions.
@@ -229,6 +255,7 @@ class MomentumWorkspace(StressWorkspace):
         """
         if self._device_iteration is None or not self._leads:
             steps_taken = self.method.check_every * PERIOD
+            self.problem.steps_taken += steps_taken
             return steps_taken, *self.judge(
                 self.problem.advance(self.method.check_every), steps_taken
             )
@@ -239,6 +266,7 @@ class MomentumWorkspace(StressWorkspace):
             int(found[kernels.DONE]) - self._steps_counted,
             int(found[kernels.DONE]),
         )
+        self.problem.steps_taken += steps_taken
         return steps_taken, bool(found[kernels.DUE]), bool(found[kernels.STAGNATES])
 
     def start(self, *, warm: bool, tolerance: float) -> bool:
@@ -246,8 +274,10 @@ class MomentumWorkspace(StressWorkspace):
 
         The minimum holds for any residual.
         """
+        self._tolerance = tolerance
         if self._device_iteration is not None and self._leads:
-            return bool(self._device_iteration.decisions()[kernels.LEAST] > 0.0)
+            self._least = int(self._device_iteration.decisions()[kernels.LEAST])
+            return self._least > 0
         stress, method = self.problem, self.method
         pressure_step, shear_step, lookahead = method.steps(stress)
         stress.restart(
@@ -256,14 +286,16 @@ class MomentumWorkspace(StressWorkspace):
             lookahead=lookahead,
             momentum=method.momentum,
         )
-        self._aim, self._best, self._limits = tolerance, math.inf, list(method.calm)
+        self._aim, self._best = self._early * tolerance, math.inf
+        self._limits = list(method.calm)
         # Counts of steps: done, at the best estimate, at the last change of estimate or momentum.
         self._done, self._best_at, self._moved = 0, 0, 0
         self._least, self._still = method.least, 0.0
+        falls = self.norm <= tolerance and stress.mean_stress < tolerance
         if stress.cold:
-            self._least, self._still = method.cold, STILL_SHARE * tolerance
+            self._least, self._still, falls = method.cold, STILL_SHARE * tolerance, False
             stress.limit_momentum(method.momentum_limit(stress))
-        if self.norm <= NOTHING * tolerance:
+        if falls or self.norm <= NOTHING * tolerance:
             self._least = 0
         return self._least > 0
 

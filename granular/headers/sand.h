@@ -187,8 +187,10 @@ auto wall_bound = [&](float mu, auto load) {
 
 // snippet wall_face: Friction on a wall face of a cell: the copies on its edges, two of each shear,
 // within `wall_bound` of the normal load, in the metric sum b_q^2 / 2. The load is that of the
-// face: x - n, plus the weight of the half cell before it, or of the whole cell if there is no
-// pressure. `rate` and `light`: rate of shear of an edge, and the sum of 1 / mass around it.
+// face: x - n at the cell's center, plus the weight W / 2 of the half cell before it. Of the half
+// beyond the center, the pressure bears x; the wall bears the rest, if x < W / 2. So sand at rest
+// without more sand on top, with x = W / 2, and a cell without pressure both load it with W.
+// `rate` and `light`: rate of shear of an edge, and the sum of 1 / mass around it.
 // `from`: start of a copy's step. `store` receives its new value and the face's diagonal.
 #include "wall_bound"
 const float* shares[3] = XYZ(share);
@@ -199,7 +201,8 @@ auto face = [&](int entry, auto from, const float* now, const float* weight, T o
     const float x = now[cell], n = DIM == 3 ? now[(1 + axis) * layer + cell]
                                             : (axis == 0 ? 1.0f : -1.0f) * now[layer + cell];
     const float toward = (side ? 1.0f : -1.0f) * weight[axis],
-                load = x - n + (x > 0.0f ? 0.5f : 1.0f) * toward * fraction[cell];
+                half = 0.5f * toward * fraction[cell], rest = half - (x > 0.0f ? x : 0.0f),
+                load = x - n + half + (rest > 0.0f ? rest : 0.0f);
     const T bound = wall_bound(friction[walls[entry]], load > 0.0f ? load : 0.0f);
     T b[2][2], most[2] = {0, 0}, sum[2] = {0, 0}, stiffest = 0, share[2][2];
     long long slot[2][2], at[2][2];
@@ -259,6 +262,7 @@ auto face = [&](int entry, auto from, const float* now, const float* weight, T o
 };
 
 // snippet wall_sums: Sums over entries of walls, behind those of other entries.
-const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, es, ee, ss, 0, residual};
+const double third = RESIDUAL ? work : es;
+const double found[COLUMNS] = {RESIDUAL ? residual : 0, 0, 0, third, ee, ss, 0, residual};
 for (int c = 0; c < COLUMNS; ++c)
     partials[c * (long long)(given.partials.shape[0] / COLUMNS) + behind + c_] = found[c];

@@ -93,18 +93,19 @@ for (int d = 0; d < SHEARS; ++d) {
 // x_before). Sums of pressure (0, 1, 2) and of friction (3, 4, 5) in the metric of the diagonal:
 // <e, s>, <e, e>, <s, s> with the error of the projection e = x_new - y and the step s = x_new - x;
 // 6, 7: estimates of the squared natural residuals of both. RESIDUAL: a step of length 1 from the
-// stresses themselves; nothing is changed, and sums 0 and 1 are the squared natural residuals.
+// stresses themselves; nothing is changed. Sums 0 and 1 are the squared natural residuals, 2 the
+// squared stresses, and 3 the work of the error of `Stress.take_residual`.
 // TRIAL: no sums; the new stresses go to `point` alone, which a step no longer needs once the
 // velocity there is known.
 //   compute    float32 | float64
 //   whole      int32 spans; float64 momentum; float32 numbers; float64 partials
-//   box        uint8 flags; float32 now, before, point, drive, stiff, openings?, share_x, share_y?,
-//              share_z?, mass_x, mass_y?, mass_z?, inverse_x, inverse_y?, inverse_z?; T edge_x,
-//              edge_y?, edge_z?, u_x, u_y?, u_z?
+//   box        uint8 flags; float32 now, before, point, past, drive, stiff, openings?, share_x,
+//              share_y?, share_z?, mass_x, mass_y?, mass_z?, inverse_x, inverse_y?, inverse_z?; T
+//              edge_x, edge_y?, edge_z?, u_x, u_y?, u_z?
 //   constants  NEWTON, COLUMNS, LEAST_RADIUS, FRICTION, COHESION, TENSION, PRESSURE_STEP,
 //              SHEAR_STEP, LOOKAHEAD, HOLDS, SHEARS_HERE, FIRM, STEP_OF_CELL, NEARLY, GAIN,
-//              HALFWAY, DIM, BOX = 0, RATE = 0, CUT = 0, RESIDUAL, TRIAL = 0, NOW_X, NOW_S, NEXT_X,
-//              NEXT_S
+//              HALFWAY, RATIO, UNSURE, DIM, BOX = 0, RATE = 0, CUT = 0, RESIDUAL, TRIAL = 0, NOW_X,
+//              NOW_S, NEXT_X, NEXT_S
 #if !TRIAL
 const long long columns = given.partials.shape[0] / COLUMNS;
 double* partial = partials + (k * (long long)given.flags.shape[1] + j) * L.chunks + c_;
@@ -123,6 +124,9 @@ FIELD(flags);
 FIELD(now);
 FIELD(before);
 FIELD(point);
+#if RESIDUAL
+FIELD(past);
+#endif
 FIELD(drive);
 FIELD(stiff);
 FIELD(openings);
@@ -140,6 +144,10 @@ auto start = [&](int c, long long i, T beta) INLINE {
     return RESIDUAL ? x : x + beta * (x - (T)before[c * layer + i]);
 };
 T x_es = 0, x_ee = 0, x_ss = 0, s_es = 0, s_ee = 0, s_ss = 0, x_residual = 0, s_residual = 0;
+#if RESIDUAL
+const T ratio = (T)numbers[RATIO], unsure = (T)numbers[UNSURE];
+T carried = 0, error_work = 0;
+#endif
 MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
     const int sand = flags[i] & HOLDS, dense = flags[i] & SHEARS_HERE, firm = flags[i] & FIRM;
     T diagonal = 0, e[DIM], mean = 0;
@@ -181,6 +189,9 @@ MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
             keep = sheared ? shrink : (T)0;
     const int cell = AGAIN(keep, i);
     T es = 0, ee = 0, ss = 0;
+#if RESIDUAL
+    T work = 0;
+#endif
     // held: copies on walls belong to the walls
     auto put = [&](int c, T value, T from, T weight, T ahead, int held) INLINE {
         const long long at = c * layer + cell;
@@ -189,6 +200,10 @@ MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
         es += share_ * e_ * s_;
         ee += share_ * e_ * e_;
         ss += share_ * s_ * s_;
+#if RESIDUAL
+        carried += share_ * (T)old * (T)old;
+        work += share_ * magnitude(s_) * (magnitude((T)old - ratio * (T)past[at]) + unsure);
+#endif
         if (TRIAL)
             point[at] = held ? ahead_of : (float)value;
         else if (!RESIDUAL) {
@@ -212,15 +227,24 @@ MASKED for (int i = begin + ROW; i < END + ROW; ++i) {
     es = 0;
     ee = 0;
     ss = 0;
+#if RESIDUAL
+    error_work += (T)stiff[i] * work;
+    work = 0;
+#endif
     put(0, x, y, (T)1, ahead_x, 0);
     x_es += diagonal * es;
     x_ee += diagonal * ee;
     x_ss += diagonal * ss;
     x_residual += RESIDUAL ? ss : ee;
+#if RESIDUAL
+    error_work += diagonal * work;
+#endif
 }
 #if RESIDUAL
 partial[0] = x_residual;
 partial[columns] = s_residual;
+partial[2 * columns] = carried;
+partial[3 * columns] = error_work;
 #elif !TRIAL
 const T found[COLUMNS] = {x_es, x_ee, x_ss, s_es, s_ee, s_ss, x_residual, s_residual};
 for (int c = 0; c < COLUMNS; ++c) partial[c * columns] = found[c];
@@ -243,16 +267,17 @@ for (int c = 0; c < COLUMNS; ++c) partial[c * columns] = found[c];
 // the cells. TRIAL: after one that has left its stresses in `point`
 //   compute    float32 | float64
 //   whole      int32 cells; uint8 sides; int32 walls; float32 friction, fraction, now, before,
-//              point; T edge_x, edge_y?, edge_z?; float32 share_x, share_y?, share_z?, inverse_x,
-//              inverse_y?, inverse_z?; float64 momentum; float32 numbers; float64 partials
+//              point, past; T edge_x, edge_y?, edge_z?; float32 share_x, share_y?, share_z?,
+//              inverse_x, inverse_y?, inverse_z?; float64 momentum; float32 numbers; float64
+//              partials
 //   box        int32 active
 //   numbers    int behind
 //   constants  NEWTON, COLUMNS, LEAST_RADIUS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD,
-//              GAIN, DIM, BOX = 0, RESIDUAL, TRIAL = 0, NOW_S, NEXT_S
+//              GAIN, RATIO, UNSURE, DIM, BOX = 0, RESIDUAL, TRIAL = 0, NOW_S, NEXT_S
 #include "sand.h:shape"
 #include "sand.h:wall_face"
 #include "sand.h:light"
-double es = 0, ee = 0, ss = 0, residual = 0;
+double es = 0, ee = 0, ss = 0, residual = 0, work = 0;
 const T* rates[3] = XYZ(edge);
 const T omega = RESIDUAL ? (T)1 : (T)numbers[SHEAR_STEP],
         beta = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
@@ -276,6 +301,10 @@ for (int m = first; m < end; ++m) {
             ee += 0.5 * stiff * e_ * e_;
             ss += 0.5 * stiff * s_ * s_;
             residual += 0.5 * (RESIDUAL ? s_ * s_ : e_ * e_);
+#if RESIDUAL
+            const T change = old - (T)numbers[RATIO] * (T)past[slot];
+            work += 0.5 * stiff * fabs(s_) * (fabs(change) + (T)numbers[UNSURE]);
+#endif
             if (!RESIDUAL) {
                 before[slot] = (float)old;
                 now[slot] = (float)value;
@@ -306,12 +335,12 @@ for (int m = first; m < end; ++m) {
 // whole cell if no sand is above it.
 //   compute    float32 | float64
 //   whole      float32 walls, friction; uint8 flags; float32 fraction, openings?, now, before,
-//              point, share_x, inverse_x, inverse_y?, inverse_z?; T u_x, u_y?, u_z?; float64
+//              point, past, share_x, inverse_x, inverse_y?, inverse_z?; T u_x, u_y?, u_z?; float64
 //              momentum; float32 numbers; float64 partials
 //   box        int32 cells, numbers_of
 //   numbers    int behind
-//   constants  COLUMNS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD, HOLDS, GAIN, DIM, BOX =
-//              0, RESIDUAL, NOW_S, NEXT_S
+//   constants  COLUMNS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD, HOLDS, GAIN, RATIO,
+//              UNSURE, DIM, BOX = 0, RESIDUAL, NOW_S, NEXT_S
 #include "sand.h:shape"
 #include "sand.h:wall_bound"
 const float* inverse[3] = XYZ(inverse);
@@ -320,7 +349,7 @@ const float* weight = numbers + WEIGHT;
 const T omega = RESIDUAL ? (T)1 : (T)numbers[SHEAR_STEP],
         beta = RESIDUAL ? (T)0 : (T)momentum[NOW_S];
 const T ahead = (T)momentum[NEXT_S] * (T)numbers[LOOKAHEAD];
-double es = 0, ee = 0, ss = 0, residual = 0;
+double es = 0, ee = 0, ss = 0, residual = 0, work = 0;
 for (int m = first; m < last; ++m) {
     const long long cell = cells[m];
     if (!(flags[cell] & HOLDS)) continue;
@@ -365,6 +394,10 @@ for (int m = first; m < last; ++m) {
         ee += stiffest * e_ * e_;
         ss += stiffest * s_ * s_;
         residual += RESIDUAL ? s_ * s_ : e_ * e_;
+#if RESIDUAL
+        const T change = (old - (T)numbers[RATIO] * (T)past[at]) / scale;
+        work += stiffest * fabs(s_) * (fabs(change) + (T)numbers[UNSURE]);
+#endif
         if (!RESIDUAL) {
             before[at] = (float)old;
             now[at] = (float)(scale * value);

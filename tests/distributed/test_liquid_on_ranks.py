@@ -55,7 +55,13 @@ SANDS = (
 # of which it is a small part.
 NOISE = {
     **dict.fromkeys(
-        ("solve_residual", "viscous_residual", "coupled_residual", "predicted_excess"),
+        (
+            "solve_residual",
+            "viscous_residual",
+            "coupled_residual",
+            "velocity_error",
+            "predicted_excess",
+        ),
         lambda row: 1.0,
     ),
     "max_divergence": lambda row: 32.0 * max(row["max_speed"], 0.1),

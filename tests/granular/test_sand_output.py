@@ -30,6 +30,7 @@ def test_the_log_has_the_columns_of_sand(folder: Path) -> None:
         rows = list(csv.DictReader(stream))
     for name in (
         "coupled_residual",
+        "velocity_error",
         "staggering_iterations",
         "yielded",
         "dissipation",

@@ -350,9 +350,8 @@ def wall_move(
         return 0.0
     x = now[(0, *cell)]
     toward = (1.0 if side else -1.0) * DT * GRAVITY[axis]
-    load = -total_stress(case, axis)[cell] + (0.5 if x > 0.0 else 1.0) * toward * float(
-        p.fraction.numpy()[cell]
-    )
+    half = 0.5 * toward * float(p.fraction.numpy()[cell])
+    load = -total_stress(case, axis)[cell] + half + max(half - max(x, 0.0), 0.0)
     inverse, share = case.field("inverse"), case.field("share")
     point, old, groups, pulls, stiffest = [], [], [], [], 0.0
     for shear, (alpha, beta) in enumerate(AXES[dimension]):
@@ -500,6 +499,23 @@ def test_the_residual_is_how_far_the_projection_moves_the_stress(
     assert pressure == pytest.approx(np.sqrt(moves[:, 0].sum() / len(cells)), rel=1e-4)
     assert rubs > 0.0
     assert friction == pytest.approx(np.sqrt((moves[:, 1].sum() + rubs) / len(cells)), rel=1e-3)
+
+
+@pytest.mark.parametrize(("dimension", "seed"), CASES)
+def test_the_load_of_walls_is_continuous_in_the_pressure(dimension: int, seed: int) -> None:
+    """Load of a wall as the pressure of its cell goes to 0.
+
+    Half of the weight of all cells without pressure appeared there before.
+    """
+    case = make(dimension, seed)
+    frictions = []
+    for pressure in (0.0, 1e-7):
+        stress = np.zeros(case.stress.now.shape, dtype=np.float32)
+        stress[0] = pressure * (case.packing.flags.numpy() > 0)
+        case.stress.now.assign(stress)
+        frictions.append(case.stress.residual()[1])
+    assert frictions[0] > 0.0
+    assert frictions[1] == pytest.approx(frictions[0], abs=1e-5)
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
