@@ -390,3 +390,22 @@ def test_linear_velocities_beside_a_sheet_are_interpolated_exactly(dimension: in
     grid.barriers.faces_to_particles(0, field, None, 0.0, velocity, places, velocity, gradient)
     np.testing.assert_allclose(velocity.numpy()[:, 0], 1.0 + x @ slope, atol=1e-5)
     np.testing.assert_allclose(gradient.numpy(), np.tile(slope, (40, 1)), atol=1e-4)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_cells_at_a_sheet_are_surrounded_by_those_on_their_side(dimension: int) -> None:
+    """Liquid on the left of a sheet is surrounded up to the sheet, and not at its surface."""
+    count = 8
+    sheet = box([0.5, -0.1, -0.1][:dimension], [0.51, 1.1, 1.1][:dimension])
+    high = [0.5, *[1.0] * (dimension - 1)]
+    pool = box([0.0] * dimension, high)
+    simulation = create(
+        scene(size=[1.0] * dimension, resolution=count, liquid=[pool], solid=[sheet])
+    )
+    grid, barriers = simulation.grid, simulation.grid.barriers
+    inside = np.zeros(grid.shape, dtype=np.uint8)
+    inside[..., :5] = 1  # the ring and the cells up to the sheet
+    around = grid.field(wp.uint8)
+    barriers.surround(grid.domain, wp.array(inside, dtype=wp.uint8, device=grid.device), around)
+    row = around.numpy()[(count // 2,) * (dimension - 1) if dimension == 3 else (1, count // 2)]
+    assert row[4] == 1 and row[5] == 0

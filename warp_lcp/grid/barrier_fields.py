@@ -7,6 +7,7 @@ from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
 from warp_lcp.grid.level_set_kernels import slope_beside
 
 MODULE = "warp_lcp.grid.barrier_fields"
+FAR = wp.constant(2)  # value of `surrounded_kernel` away from thin solids
 
 
 @wp.func
@@ -102,6 +103,29 @@ def binomial_kernel(k, j, i, near: U8, apart: U8, planes: int, source: F32, out:
             step = stand_in(apart, k, j, i, wp.vec3i(dk, dj, di))
             total += w * source[k + step[0], j + step[1], i + step[2]]
         out[k, j, i] = total
+
+
+@cell_kernel(MODULE)
+def surrounded_kernel(k, j, i, near: U8, apart: U8, planes: int, inside: U8, around: U8):
+    """Find the cells whose neighbors on their own side of thin solids are all inside.
+
+    `inside` is 1 in cells inside the material and in solids. `around` is 1 if it is 1 in the cell
+    and in all cells around it that no thin solid separates from it, 0 if it is not, and `FAR` away
+    from thin solids.
+    """
+    result = wp.uint8(FAR)
+    if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
+        result = wp.uint8(1)
+        for n in range(wp.where(planes == 2, 27, 9)):
+            di = n % 3 - 1
+            dj = (n // 3) % 3 - 1
+            dk = int(0)
+            if planes == 2:
+                dk = n // 9 - 1
+            if inside[k + dk, j + dj, i + di] == wp.uint8(0):
+                if free_path(apart, k, j, i, dk, dj, di):
+                    result = wp.uint8(0)
+    around[k, j, i] = result
 
 
 @cell_kernel(MODULE)

@@ -21,7 +21,7 @@ import warp as wp
 from warp_lcp.grid import barrier_faces_kernels as faces_kernels
 from warp_lcp.grid import barrier_transfer_kernels as transfer_kernels
 from warp_lcp.grid import barrier_velocity_kernels as velocity_kernels
-from warp_lcp.grid.barrier_fields import binomial_kernel, shift_kernel
+from warp_lcp.grid.barrier_fields import binomial_kernel, shift_kernel, surrounded_kernel
 from warp_lcp.grid.barrier_geometry import CENTERS, REACH, Barrier
 from warp_lcp.grid.barrier_volume import filled_kernel
 from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
@@ -323,6 +323,18 @@ class Barriers:
         """
         given = [self.near, self.apart[-1], self.grid.planes, source, out]
         window.launch(binomial_kernel, given)
+
+    def surround(self, window: Window, inside: wp.array, around: wp.array) -> None:
+        """Find the cells near the solids whose neighbors on the same side are all inside.
+
+        Args:
+            window: cells to consider.
+            inside: uint8, 1 in cells inside the material and in solids, 0 elsewhere.
+            around: uint8: 1 if the cell and all neighbors that it sees are inside, 0 if not,
+                `warp_lcp.grid.barrier_fields.FAR` away from the solids (written).
+        """
+        given = [self.near, self.apart[-1], self.grid.planes, inside, around]
+        window.launch(surrounded_kernel, given)
 
     def shift(
         self,

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp
 
 import warp_lcp as wl
+from warp_lcp.grid.barrier_fields import FAR
 from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.level_set import Fill, particle_density
 from warp_lcp.grid.particles import Particles
@@ -36,6 +37,7 @@ CONSTANTS = {"FLUID": FLUID, "SOLID": SOLID, "AIR": AIR, "RELEASED": RELEASED} |
     "LEAST_DENSITY": 0.5,
     "LEAST_CAPACITY": 0.1,  # least capacity by which densities are divided there
     "HALF": 0.5,  # share of what a cell can hold; a cell with less is at the surface
+    "FAR": int(FAR),  # mark of cells away from thin solids
 }
 
 
@@ -297,7 +299,7 @@ class DensityCorrection:
         wp.copy(self._kind, boundary.base)
         self._displace = displacement_pass(bool(boundary.open))
         self._over, self._lacking = WindowReduction(PREPARE, grid), WindowReduction(EVEN, grid)
-        self._inside = self._lower = None
+        self._inside = self._own_side = self._lower = None
         self._counted = (
             wp.zeros(1, dtype=wp.float64, device=grid.device)
             if even and grid.device.is_cuda
@@ -307,6 +309,7 @@ class DensityCorrection:
             self._inside = wp.array(
                 boundary.base.numpy() == SOLID, dtype=wp.uint8, device=grid.device
             )
+            self._own_side = grid.field(wp.uint8) if grid.barriers is not None else None
             self._lower = grid.field(wp.float64)
         self._shift = (
             wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device)
@@ -443,9 +446,16 @@ class DensityCorrection:
         if self._inside is not None:
             self.grid.part.fill(self._inside)  # before those deep inside are told by them
             self._wrap(self._inside)
+            if self.grid.barriers is not None:
+                self.grid.barriers.surround(self._solved, self._inside, self._own_side)
             least, planes = min(most, 2.0 - most), self.grid.planes - 1
             self._lacking.launch(
-                self._solved, fields, least=least, planes=planes, lower=self._lower
+                self._solved,
+                fields,
+                own_side=self._own_side,
+                least=least,
+                planes=planes,
+                lower=self._lower,
             )
             if self._counted is not None:
                 launch(

@@ -576,9 +576,15 @@ def make_reseeding(
 
 
 def make_density_correction(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, most: float | None = None
 ) -> DensityCorrection:
     """Return the density correction of a scene.
+
+    Args:
+        scene: the scene.
+        grid: its grid.
+        boundary: its solids.
+        most: largest density of a cell, relative to rest; None: that of the scene.
 
     Raises:
         ValueError: the scene has none.
@@ -592,7 +598,7 @@ def make_density_correction(
         boundary,
         solver,
         particles_a_cell=scene.particles.per_axis**grid.dimension,
-        max_density=settings.largest(scene.particles.per_axis),
+        max_density=most if most is not None else settings.largest(scene.particles.per_axis),
         every=settings.every,
         gain=scene.correction_gain,
         even=scene.keeps_volume,

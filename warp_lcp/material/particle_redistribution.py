@@ -28,6 +28,8 @@ PACE = 2.0  # factor on sqrt(dx / g): time in which an automatic correction remo
 # Splashes among solids at rest have up to 0.034. Motions of rigid bodies do not count.
 SEVERE, SEVERE_THIN = 0.03, 0.003
 PASSES = 8  # most corrections in a step
+# Largest density of a cell, relative to rest, beside driven thin solids; the least is 2 minus it.
+MOST_THIN = 1.02
 
 
 class ParticleRedistribution:
@@ -44,6 +46,11 @@ class ParticleRedistribution:
     than a fraction `SEVERE` is in excess (`SEVERE_THIN` where thin solids move), a correction
     removes more, up to all of the excess from twice that fraction on. A correction moves particles
     by half a cell at most, and is then repeated until less than that fraction is in excess.
+
+    Walls that turn leave gaps: particles go straight on within a step, and along a wall at distance
+    h from the center of its rotation, at omega [1/s], they depart from it by about omega^2 h dt^2 /
+    2. The density there falls, so that nothing is in excess. Where thin solids are driven, each
+    step therefore corrects all of the density, to 1 +- (`MOST_THIN` - 1).
 
     Args:
         scene: the scene, with its settings.
@@ -63,6 +70,11 @@ class ParticleRedistribution:
         self._scene, self._grid, self._boundary = scene, grid, boundary
         self.reseeding = make_reseeding(scene, grid, boundary)
         self.density_monitor = make_density_monitor(scene, grid, boundary)
+        driven = scene.keeps_volume and any(solid.motion is not None for solid in scene.solid)
+        thin = boundary.thin is not None and boundary.thin.moves
+        self._severe = (SEVERE_THIN if thin else SEVERE) if driven else math.inf
+        # Whether each step corrects all of the density.
+        self._always = driven and thin and self.density_monitor is not None
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
@@ -70,9 +82,6 @@ class ParticleRedistribution:
             self.correction = self._make_correction()
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]
-        severe = SEVERE if boundary.thin is None or not boundary.thin.moves else SEVERE_THIN
-        driven = any(solid.motion is not None for solid in scene.solid)
-        self._severe = severe if driven and scene.keeps_volume else math.inf
         self.moved = False
         # Whether a step has measured the density monitor, and the number of the last step that
         # called `measure_density`.
@@ -215,16 +224,18 @@ class ParticleRedistribution:
 
     def _parts(self, step: int) -> bool:
         if self.density_monitor is not None:
-            return self._looked and self.density_monitor.read_densities()[0] > self._most
+            if self._always or not self._looked:
+                return self._looked
+            return self.density_monitor.read_densities()[0] > self._most
         return self.correction is not None and step % self.correction.every == 0
 
     def _share(self, dt: float) -> float:
         """Return the fraction of the excess that a step removes.
 
-        All of it where the scene sets the steps. Otherwise a fraction in proportion to the time
-        step, and more of a severe excess.
+        All of it where the scene sets the steps, and where thin solids are driven. Otherwise a
+        fraction in proportion to the time step, and more of a severe excess.
         """
-        if self.density_monitor is None or self._pace == 0.0:
+        if self.density_monitor is None or self._pace == 0.0 or self._always:
             return 1.0
         share = min(1.0, dt / self._pace)
         if math.isfinite(self._severe):
@@ -255,4 +266,5 @@ class ParticleRedistribution:
             self.correction.x.assign(state[STATE])
 
     def _make_correction(self) -> DensityCorrection:
-        return make_density_correction(self._scene, self._grid, self._boundary)
+        most = MOST_THIN if self._always else None
+        return make_density_correction(self._scene, self._grid, self._boundary, most=most)

@@ -38,10 +38,11 @@ densest = 1.0 + (double)worst;
 // kernel warp_lcp.material.density_correction.even: Equations instead of bounds for cells with
 // material all around them. `lacks`: number of such cells that hold too little
 //   compute    float64
-//   box        int8 kind; float64 b, x; float32 density, capacity; uint8 inside?; float64 lower
+//   box        int8 kind; float64 b, x; float32 density, capacity; uint8 inside?, own_side?;
+//              float64 lower
 //   numbers    float32 least; int planes
 //   sums       lacks
-//   constants  FLUID
+//   constants  FLUID, FAR
 int lacking = 0;
 unsigned char around[M];
 for (int start = first; start < last; start += M) {
@@ -52,6 +53,9 @@ for (int start = first; start < last; start += M) {
             const unsigned char* beside = inside + start + c * s1 + d * s2;
             SIMD for (int m = 0; m < n; ++m) around[m] &= beside[m - 1] & beside[m] & beside[m + 1];
         }
+    if (own_side != nullptr)  // cells near thin solids
+        for (int m = 0; m < n; ++m)
+            around[m] = own_side[start + m] == FAR ? around[m] : own_side[start + m];
     SIMD8 for (int m = 0; m < n; ++m) {
         const int i = start + m, deep = (kind[i] == FLUID) & around[m];
         const double lack = (double)(least * capacity[i] - density[i]),
