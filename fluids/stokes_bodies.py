@@ -86,8 +86,8 @@ class StokesBodies:
         self._flow.grow_entries()
         self._m, self._D = self._drag.factors()
         # Masses without supports: m itself is singular along supported directions, and a
-        # pseudo-inverse of it amplifies rounding. For z and r in the range of m, z'm^+ r = z'm0^-1 r
-        # with m0 = rho dx^d times the inverse of these masses.
+        # pseudo-inverse of it amplifies rounding. For z and r in the range of m,
+        # z'm^+ r = z'm0^-1 r with m0 = rho dx^d times the inverse of these masses.
         inverses = [body.free_inverse_mass(self._dimension) for body in self.bodies.bodies]
         self._masses = scipy.linalg.block_diag(*(np.linalg.inv(m) for m in inverses))
         self._response = np.linalg.inv(np.eye(self.rank) + self._m @ self._D)

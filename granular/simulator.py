@@ -272,8 +272,9 @@ class SandSimulation(ParticleSimulation):
 
         coupled_residual: natural residual of pressure and friction together, root mean square over
         the cells with sand, in units of rho g dx; velocity_error: estimate of the velocity's root
-        mean square error, in units of g dt, see `Stress.take_residual`; solve_residual: relative to that at the start of
-        the solve; staggering_iterations: iterations of the coupled method; yielded, dissipation,
+        mean square error, in units of g dt, see `Stress.take_residual`; solve_residual: relative to
+        that at the start of the solve; staggering_iterations: iterations of the coupled method;
+        yielded, dissipation,
         predicted_excess: see `SandReport.report`; front [m]: x up to which the deposit is connected
         at the start of the step, see `deposit_front`; max_fraction: largest fraction of a cell at
         the start of the step, relative to the densest packing; runout [m]: 99th percentile of x

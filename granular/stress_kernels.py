@@ -194,8 +194,8 @@ FIRST, LAST, DECISIONS = 11, 15, 19
 BETTER, NEAR_BEST = 0.95, 1.2
 NOTHING = 1e-3  # relative to the tolerance: nothing to solve
 STILL_SHARE = 1e-2  # relative to the tolerance: sand stays at rest
-# Factor on the first target, if the velocities have a tolerance, too: it may hold before that of the
-# residual.
+# Factor on the first target, if the velocities have a tolerance, too: it may hold before that of
+# the residual.
 EARLY = 4.0
 TIGHTER = 0.8  # factor on the target at each residual, since the estimate may be too low
 # Factor from a step of the friction over its length to its natural residual: measured.
