@@ -8,6 +8,7 @@ import warp as wp
 import warp_lcp as wl
 from warp_lcp.problem.operator_protocol import families
 from warp_lcp.problem.operator_protocol import members as names_of
+from warp_lcp.problem.solve_loop import solve as solve_by
 
 A, B = np.array([[2.0, -1.0], [-1.0, 2.0]]), np.array([0.5, -2.5])
 X = [0.5, 1.5]  # 2 * 0.5 - 1.5 + 0.5 = 0 and -0.5 + 2 * 1.5 - 2.5 = 0
@@ -73,6 +74,12 @@ def test_operators():
 def test_solves(options, message, device):
     with pytest.raises(ValueError, match=message):
         wl.solve(wl.LCP(wl.DenseOperator(A, device=device), B), **options)
+
+
+def test_a_chosen_method_is_run_with_stopping_criteria_alone(device):
+    problem = wl.LCP(wl.DenseOperator(A, device=device), B)
+    with pytest.raises(ValueError, match="stopping is a float"):
+        solve_by(problem, wl.Lemke(), stopping=1e-6)
 
 
 def test_a_matrix_is_no_problem():

@@ -251,6 +251,16 @@ def test_invalid_joint_scenes_are_refused(change: dict[str, Any], message: str) 
     assert message in str(error.value)
 
 
+def test_ball_joints_are_for_three_dimensions() -> None:
+    ball = {"kind": "ball", "solids": [1], "anchor": [0.55, 1.5, 1.0]}
+    assert loaded(tables([ball])).joint[0].kind == "ball"
+    bar = {"shape": "box", "min": [0.6, 1.4], "max": [1.0, 1.5], "density": 1000.0}
+    flat = {"solid": [bar], "domain": {"size": [3.0, 3.0]}}
+    with pytest.raises(SceneError) as error:
+        load_scene(tables([ball | {"solids": [0], "anchor": [0.6, 1.45]}], **flat))
+    assert "must be hinge in 2-D" in str(error.value)
+
+
 @pytest.mark.parametrize("name", few(["reach", "gears", "gear-pyramid", "motor-arm", "snake"], 1))
 def test_frames_of_built_in_scenes(tmp_path: Path, name: str) -> None:
     """Frames of built-in scenes.

@@ -209,6 +209,23 @@ def test_a_small_drop_does_not_fly_through_a_plate(key: str, materials: ModuleTy
         assert drop.particles.position.numpy()[:, 0].max() < 0.6 + 1.2 * width
 
 
+def test_memory_of_bodies_grows_with_the_particles() -> None:
+    """Memory for the particles of bodies: it grows with their capacity, and only then."""
+    drop = create(scene(size=[1.0, 1.0], resolution=16, liquid=[ball([0.5, 0.5], 0.15)]))
+    flights, particles = drop.flights, drop.particles
+    assert flights is not None
+    drop.step(1e-3)
+    start = flights._start
+    assert len(start) >= particles.capacity > 0
+    drop.step(1e-3)
+    assert flights._start.ptr == start.ptr
+    count = particles.count
+    particles.resize(particles.capacity + 1)
+    particles.resize(count)
+    drop.step(1e-3)
+    assert len(flights._start) >= particles.capacity > len(start)
+
+
 def test_a_drop_that_meets_a_wall_in_the_step_is_left_to_it() -> None:
     """Drop that meets a wall within the step.
 

@@ -586,6 +586,24 @@ def test_a_drop_keeps_its_contact_angle(angle: float) -> None:
     assert abs(other - 1.0) > 0.15
 
 
+def test_velocity_gradients_are_damped_near_the_surface_alone() -> None:
+    simulation = drop(16)
+    tension, particles, phi = simulation.tension, simulation.particles, simulation.surface.phi
+    assert tension is not None and phi is not None
+    simulation.step(1e-4)
+    particles.number()
+    depth = phi.numpy().ravel()[particles.key.numpy()[: particles.count]]
+    deep, near = depth == -1.5, depth > -1.4
+    for gradient in particles.affine:
+        gradient.fill_(1.0)
+    dt = 1.0 / math.sqrt(SIGMA / (RHO * simulation.grid.spacing**3))
+    tension.damp_velocity_gradients(particles, dt)
+    assert deep.any() and near.any()
+    for gradient in particles.affine:
+        np.testing.assert_array_equal(gradient.numpy()[deep], 1.0)
+        np.testing.assert_allclose(gradient.numpy()[near], math.exp(-0.2), rtol=1e-6)
+
+
 def test_a_step_is_no_longer_than_the_filter_allows() -> None:
     simulation = drop(16)
     assert simulation.tension is not None

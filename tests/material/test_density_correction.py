@@ -365,6 +365,41 @@ def test_a_step_repeats_the_correction_of_severe_excess_beside_moving_solids(mov
     assert (way > 0.8 * 0.5 * 0.25 / 3.0) == moves
 
 
+def test_a_correction_is_repeated_by_the_density_where_particles_are_now(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Excess that decides on a repetition, with a moving plate thinner than a cell.
+
+    Particles then stand in a list for each cell. A correction moves them to other cells, and the
+    density must not be that of the lists before.
+    """
+    plate = box([0.4, 0.42], [0.6, 0.435])
+    plate["motion"] = {"kind": "translation", "velocity": [0.01, 0.0]}
+    squeezed = pool(solid=[plate])
+    particles = squeezed.particles
+    assert particles.offsets is not None
+    position = particles.position.numpy() * np.array([1.0, 0.75, 1.0], dtype=np.float32)
+    particles.position.assign(position)
+    particles.sort()
+    monitor = squeezed.rearrangement.density_monitor
+    assert monitor is not None
+    measure, pairs = monitor.measure, []
+
+    def measured_twice(density: wp.array | None, particles: Particles, window: Any) -> None:
+        measure(density, particles, window)
+        if density is None:
+            found = monitor.read_densities()
+            particles.sort()
+            measure(None, particles, window)
+            pairs.append((found, monitor.read_densities()))
+
+    monkeypatch.setattr(monitor, "measure", measured_twice)
+    squeezed.step(1e-4)
+    assert len(pairs) > 2
+    for found, expected in pairs:
+        assert found == pytest.approx(expected, rel=1e-6)
+
+
 @pytest.mark.parametrize("table", [{}, {"density_correction": {"every": 0}}])
 def test_a_collapsed_column_has_the_volume_that_it_had(table: dict[str, Any]) -> None:
     """Volume of a collapsed column.

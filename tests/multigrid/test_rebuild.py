@@ -9,6 +9,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.multigrid import CycleSettings, Hierarchy
+from warp_lcp.multigrid.halo_levels import keep_side_kernel, mark_side_kernel
 
 GRIDS = [
     ((24, 21, 19), (False,) * 3, {}),
@@ -250,3 +251,33 @@ def test_new_cells_that_are_the_old_ones_change_no_row(device):
     hierarchy.refresh()
     hierarchy.mask_diagonal(A.stencil.d, stored(A, cells == wl.FLUID))
     assert not hierarchy.finest.changed.numpy().any()
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_rows_beside_changed_ghost_cells_are_marked(axis, device):
+    """Rows beside ghost cells of another process: marked where a ghost cell has changed.
+
+    Nowhere else, and nowhere if none has.
+    """
+    nx, ny, nz = counts = 4, 3, 2
+    rng = np.random.default_rng(841)
+    d = rng.uniform(1.0, 2.0, (nz + 2, ny + 2, nx + 2))
+    field = wp.array(d, dtype=wp.float64, device=device)
+    across = [n for a, n in enumerate(counts[::-1]) if a != 2 - axis]
+    known = wp.zeros(across, dtype=wp.float64, device=device)
+    changed = wp.zeros((nz, ny), dtype=wp.uint8, device=device)
+    at, row = counts[axis] + 1, counts[axis] - 1
+    wp.launch(keep_side_kernel, across, [field, axis, at, known], device=device)
+    mark = [field, axis, at, row, known, changed]
+    wp.launch(mark_side_kernel, across, mark, device=device)
+    assert not changed.numpy().any()
+    cell = [1, 2, 3]  # k, j, i of a stored cell
+    cell[2 - axis] = at
+    d[tuple(cell)] += 1.0
+    field.assign(d)
+    wp.launch(mark_side_kernel, across, mark, device=device)
+    expected = np.zeros((nz, ny), dtype=bool)
+    beside = [n - 1 for n in cell]
+    beside[2 - axis] = row
+    expected[beside[0], beside[1]] = True
+    np.testing.assert_array_equal(changed.numpy() != 0, expected)

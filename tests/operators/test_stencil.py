@@ -12,6 +12,7 @@ import warp_lcp as wl
 from default_run import few
 from drawn_stencils import KINDS, border_sums, drawn, rising, rising_in_space
 from warp_lcp.operators.grid_matrix import grid_matrix
+from warp_lcp.operators.stencil import StoredStencil
 
 NINE = np.array([[-1.0, -4.0, -1.0], [-4.0, 20.0, -4.0], [-1.0, -4.0, -1.0]]) / 6
 
@@ -217,6 +218,50 @@ def test_boundary_values_are_a_term_of_b(device):
         ValueError, match=r"values has shape \(5, 7\): expected \(5, 6\) or \(7, 8\)"
     ):
         A.boundary_term(np.zeros((5, 7)))
+
+
+def test_a_stored_stencil_has_the_diagonal_that_it_is_given(device):
+    """Stencil of stored fields: the unit of a diagonal of numbers is 1."""
+    rng, cells = np.random.default_rng(6), np.ones((5, 6), dtype=int)
+    stored = np.zeros((1 + 2, 5 + 2, 6 + 2))
+    stored[1, 1:-1, 1:-1] = d = rng.uniform(4.0, 5.0, cells.shape)
+    field = wp.array(stored.ravel(), dtype=wp.float64, device=device)
+    A = StoredStencil(cells, field, (1.0, 1.0, 0.0), None, symmetric=True)
+    x = rng.standard_normal(cells.shape)
+    around = sum(
+        np.pad(x, 1)[1 + j : 6 + j, 1 + i : 7 + i] for j, i in ((0, 1), (0, -1), (1, 0), (-1, 0))
+    )
+    np.testing.assert_allclose(
+        A.apply(wp.array(x, dtype=wp.float64, device=device)).numpy(), d * x - around, atol=1e-13
+    )
+
+
+def test_null_vectors_are_found_in_space(device):
+    """Null vector of a closed box whose columns sum to 0: A v = 0, v > 0.
+
+    A moves the amount c_i x_i of each cell to its neighbors, so v_i = 1 / c_i.
+    """
+    rng, shape = np.random.default_rng(7), (3, 4, 5)
+    c = rng.uniform(0.5, 2.0, shape)
+    sides = [tuple(s * (a == b) for b in range(3)) for a in range(3) for s in (-1, 1)]
+    inside = np.pad(np.ones(shape), 1)
+    coefficients = {}
+    for o in sides:
+        there = tuple(slice(1 + s, n + 1 + s) for s, n in zip(o, shape, strict=True))
+        coefficients[o] = -np.pad(c, 1, constant_values=1.0)[there] * inside[there]
+    coefficients[0, 0, 0] = c * sum(
+        inside[tuple(slice(1 + s, n + 1 + s) for s, n in zip(o, shape, strict=True))] for o in sides
+    )
+    A = wl.Stencil(
+        np.ones(shape, dtype=int), coefficients, outside=wl.AIR, device=device, dtype=wp.float64
+    )
+    v = wp.array(1.0 / c, dtype=wp.float64, device=device)
+    np.testing.assert_allclose(A.apply(v).numpy(), 0.0, atol=1e-13)
+    found = A.floating_components()
+    assert found is not None and found.count == 1
+    b = rng.standard_normal(shape)
+    assert wl.solve(wl.LCP(A, b - b.mean(), -np.inf))
+    assert wl.solve(wl.LCP(A, b - b.mean() + 1, -np.inf)).status is wl.SolveStatus.INFEASIBLE
 
 
 def test_closed_boxes_float_and_incompatible_ones_are_infeasible(device):

@@ -243,6 +243,15 @@ def test_gamma_is_the_ratio_of_the_parts(gamma, releases):
         )
 
 
+def test_only_cold_starts_on_grids_begin_with_projected_cycles():
+    problem, *_, shape = grid(4619, 0.0, 0.5)
+    method = MPRGP(precision="double", monotone_cycles=2)
+    for x0, kinds in (None, ["monotone cycle"] * 2), (np.zeros(shape), []):
+        work = begun(problem, method.init(problem), x0)
+        names = [method.step(problem, work, work.x).name for _ in range(2)]
+        assert [name for name in names if name == "monotone cycle"] == kinds
+
+
 def test_products_of_the_conjugate_direction():
     """Products of the conjugate direction.
 

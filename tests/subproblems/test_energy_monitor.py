@@ -8,11 +8,13 @@ import pytest
 import warp as wp
 
 import warp_lcp as wl
+from method_steps import begun
 from oracle import assemble, boxed, lemke
 from warp_lcp.gallery import dam, torsion
 from warp_lcp.operators.grid_matrix import grid_matrix
 from warp_lcp.problem.solve_loop import EPS
 from warp_lcp.subproblems.energy_monitor import EnergyMonitor
+from warp_lcp.subproblems.grid_step_kernels import GZ, SIZE, ZAZ
 
 CELLS = {"strip": (1, 100), "wide-strip": (8, 2000), "vent": (60, 70), "vent-3d": (20, 22, 24)}
 
@@ -196,6 +198,29 @@ def test_projected_sweeps_lower_the_energy_from_anywhere():
         norms.append(work.residual.norm)
     assert (np.diff(energies) <= 1e-13 * np.abs(energies[:-1])).all()
     assert norms[-1] < 1e-8 * norms[0]
+
+
+def test_projected_cycles_are_taken_whole():
+    """Projected cycles: x moves by all of the correction, which keeps the bounds.
+
+    Also after truncated cycles, whose correction z would be shortened by g'z / z'Az < 1.
+    """
+    rng, shortened = np.random.default_rng(5153), 0
+    for _ in range(6):
+        cells = rng.choice([0, 1, 1, 1, 1, 2], size=(11, 8)).astype(np.int8)
+        b = rng.standard_normal(cells.shape)
+        problem = wl.LCP(wl.GridPoisson(cells, device="cpu"), b, -0.5, 0.7)
+        work = begun(problem, wl.ProjectedMultigrid(precision="double").init(problem))
+        work.truncated_step()
+        work.truncated_step()
+        scalars = work.residual.scalars.numpy()
+        shortened += scalars[ZAZ] > 1.001 * scalars[GZ] > 0.0
+        work.begin_cycles(1)
+        before, size = work.x.numpy().copy(), scalars[SIZE]
+        work.monotone_step()
+        z = work.hierarchy.finest.x.numpy()
+        np.testing.assert_allclose(work.x.numpy() - before, size * z, atol=1e-13)
+    assert shortened
 
 
 def test_runs_of_projected_steps_double():
