@@ -12,6 +12,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.fluids.pressure import COUNT
+from warp_lcp.grid.cell_kernel import launch_list, list_kernel
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import SEGMENT, ActiveWindow, StaggeredGrid, Window
 from warp_lcp.grid.transfer import accelerate, faces_to_particles, particles_to_faces
@@ -186,6 +187,23 @@ def test_copies_clears_and_graphs_within_graphs():
     with recording(program):
         inner.run()
     assert len(program) == 1
+
+
+@list_kernel("tests.launch_graph")
+def double_kernel(i, numbers: wp.array(dtype=wp.float32)):
+    """Double each number of a list."""
+    numbers[i] = 2.0 * numbers[i]
+
+
+def test_a_list_that_is_launched_by_a_program_runs_with_the_program(threads):
+    values = np.arange(1.0, 10_001.0, dtype=np.float32)
+    numbers = wp.array(values, device=GRID.device)
+    program = CommandBuffer(GRID.device)
+    launch_list(double_kernel, len(values), [numbers], device=GRID.device, launch=program.launch)
+    np.testing.assert_array_equal(numbers.numpy(), values)
+    for times in (2.0, 4.0):
+        program.run()
+        np.testing.assert_array_equal(numbers.numpy(), times * values)
 
 
 def test_variants_are_recorded_for_themselves():
