@@ -230,5 +230,6 @@ CHECK = ValidationCheck(
         ),
         _law,
     ],
-    known="deep sand that yields everywhere is solved to 2 to 5e-3 rho g dx, not 1e-3",
+    known="deep sand that yields everywhere: 10 % of the steps at the narrowest slot miss the "
+    "error",
 )
