@@ -227,5 +227,5 @@ CHECK = ValidationCheck(
     across=("both", alike),
     charts=[plot("sand-heaps", "Heaps and wedges", "x [m]", "y [m]")],
     known="sand at rest holds up to asin k, 39.6 degrees for an angle of repose of 35: such heaps "
-    "lie at 38 to 39; heaps of 30 degrees lie at 30 to 32.5, by the seed of the particles",
+    "lie at 38 to 39; heaps of 30 degrees lie at 31 to 33, by the seed of the particles",
 )
