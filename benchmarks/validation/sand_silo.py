@@ -8,7 +8,8 @@ with c = 2 between two walls, and 4 in a square of four [Janssen 1895]. K is the
 on the walls to the vertical stress. It lies between 1/3, where sand of a sine of 1/2 yields
 sideways, and 1; the bounds of the check are a tenth beyond either. The vertical stress is the
 pressure less the deviator's part, averaged over a cross-section. The depth is the mass above it
-over rho W, which does not depend on the surface.
+over rho W, which does not depend on the surface. Walls rougher than the sand bear what the sand
+beside them bears: mu is at most the slope k of its yield set.
 """
 
 from __future__ import annotations
@@ -82,11 +83,12 @@ def trial(
     more: Tables = {"deep": deep or DEEP[dimension], "square": dimension == 3}
     depths = range(1, math.ceil(more["deep"]))
     for friction in frictions:
+        simulation = fill(cells, friction, **more)
         bears(
             findings,
             f"mu = {friction:g}",
-            rest(fill(cells, friction, **more)),
-            friction,
+            rest(simulation),
+            min(friction, simulation.scene.slope),
             depths,
             walls=2 * dimension - 2,
         )
