@@ -307,6 +307,14 @@ class LiquidScene(ParticleScene):
             models.append(SceneModel("viscosity", "viscosity.value"))
         if self.couples:
             models.append(SceneModel("coupled solve", "viscosity.splitting_tolerance"))
+        elif self.viscosity is not None and math.isfinite(self.viscosity.splitting_tolerance):
+            models.append(
+                SceneModel(
+                    "coupled solve",
+                    'pressure.model = "unilateral": viscosity and pressure act one after the other',
+                    built=False,
+                )
+            )
         if self.surface_tension is not None:
             models.append(
                 SceneModel(

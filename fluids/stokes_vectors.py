@@ -74,6 +74,9 @@ def launch_graphs(device: wp.Device, *functions: Callable[..., None]) -> dict[st
 class WindowSums:
     """Reductions of a kernel that runs once, or once for each component.
 
+    The rows of the whole grid are summed, so that results do not depend on the window: the first
+    step of a resumed run has a larger one.
+
     Args:
         kernel: the kernel.
         grid: the grid.
@@ -81,7 +84,8 @@ class WindowSums:
     """
 
     def __init__(self, kernel: StencilKernel, grid: StaggeredGrid, parts: int = 1) -> None:
-        self._parts = [WindowReduction(kernel, grid) for _ in range(parts)]
+        counted = grid.everywhere
+        self._parts = [WindowReduction(kernel, grid, counted) for _ in range(parts)]
 
     def launch(self, window: Window, part: int = 0, **arguments: object) -> None:
         """Launch a part over a window."""

@@ -444,6 +444,23 @@ def test_resumed_coupled_steps_have_the_same_bits() -> None:
         np.testing.assert_array_equal(one.numpy(), other.numpy())
 
 
+def test_errors_of_a_resumed_step_do_not_depend_on_the_window() -> None:
+    # The first step of a resumed run has the whole grid as its window.
+    drawn = scene(
+        size=[0.6, 0.4],
+        resolution=36,
+        wall="sticky",
+        liquid=[box([0.0, 0.0], [0.35, 0.3])],
+        viscosity={"value": 5.0, "splitting_tolerance": 1.0},
+    )
+    whole = create(drawn)
+    for _ in range(5):
+        resumed = create(drawn)
+        resumed.restore(whole.state())
+        rows = [simulation.step(0.01) for simulation in (whole, resumed)]
+        assert rows[0]["splitting_error"] == rows[1]["splitting_error"] > 0.0
+
+
 @pytest.mark.parametrize("resolution", few([16, 32], 1))
 def test_iterations_hardly_depend_on_viscosity_and_resolution(resolution: int) -> None:
     counts = []

@@ -448,3 +448,14 @@ def test_open_sides_build_no_separating_walls() -> None:
     simulation = small_liquids.create(model)
     simulation.step(0.01)
     assert simulation.projection.fields()[2] is simulation.projection._start, "no field of bounds"
+
+
+def test_unilateral_pressure_builds_no_coupled_solve() -> None:
+    thick = LIQUID | {"viscosity": {"value": 10.0}}
+    coupled = small_liquids.scene(**thick)
+    assert ("coupled solve", True) in [(part.name, part.built) for part in coupled.models()]
+    model = small_liquids.scene(**(thick | {"pressure": {"model": "unilateral"}}))
+    solve = next(part for part in model.models() if part.name == "coupled solve")
+    assert not solve.built
+    assert ("not built", f"coupled solve: {solve.why}") in model.plan()
+    assert small_liquids.create(model).stokes is None
