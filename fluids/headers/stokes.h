@@ -382,7 +382,8 @@ square = sum;
 //   box        float32 u, force, volume, diagonal
 //   sums       kinetic, power
 EXACT_MATH  // the sums of a row do not depend on where the window ends
-double kinetic_sum = 0.0, power_sum = 0.0;
+    double kinetic_sum = 0.0,
+           power_sum = 0.0;
 for (int i = first; i < last; ++i) {
     if (!(volume[i] > 0.0f)) continue;
     kinetic_sum += (double)volume[i] * u[i] * u[i];
