@@ -99,12 +99,14 @@ def deposit_front(depth: np.ndarray) -> float:
     """
     if not len(depth) or depth.max() < LEAST_DEPTH:
         return 0.0
+    depth = depth.astype(np.float32)  # as on the device
     last = int(depth.argmax())
     while last + 1 < len(depth) and depth[last + 1] >= LEAST_DEPTH:
         last += 1
     if last + 1 == len(depth):
         return float(len(depth))
-    return last + 0.5 + float((depth[last] - LEAST_DEPTH) / (depth[last] - depth[last + 1]))
+    beyond = (depth[last] - np.float32(LEAST_DEPTH)) / (depth[last] - depth[last + 1])
+    return float(np.float32(last + 0.5) + beyond)
 
 
 @forward_kernel(module="granular.runout")

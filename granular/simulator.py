@@ -596,10 +596,11 @@ class SandSimulation(ParticleSimulation):
             return self._deposit.read()
         part, counts = self.grid.part, self.grid.domain_counts
         owned = part.box_of(self.packing.fraction.numpy())
-        depth = np.zeros((counts[2], counts[0]))
+        depth = np.zeros((counts[2], counts[0]), dtype=np.float32)
         i, _, k = part.first
         nz, _, nx = owned.shape
-        depth[k : k + nz, i : i + nx] = owned.sum(axis=1, dtype=np.float64)
+        # Summed from the floor up in float32, as the kernel does.
+        depth[k : k + nz, i : i + nx] = np.cumsum(owned, axis=1, dtype=np.float32)[:, -1]
         return self.grid.spacing * deposit_front(part.ranks.sum(depth).max(axis=0))
 
     def _front_of_all(self) -> tuple[float, float]:

@@ -54,16 +54,14 @@ SANDS = (
 # The remaining residual is as small as the rounding of the solve. It is compared with the quantity
 # of which it is a small part.
 NOISE = {
-    **dict.fromkeys(
-        (
-            "solve_residual",
-            "viscous_residual",
-            "coupled_residual",
-            "velocity_error",
-            "predicted_excess",
-        ),
-        lambda row: 1.0,
+    **dict.fromkeys(("viscous_residual", "coupled_residual", "predicted_excess"), lambda row: 1.0),
+    # Of sand it is the ratio of `coupled_residual` to that at the start of the solve.
+    "solve_residual": lambda row: max(
+        1.0, row["solve_residual"] / (row.get("coupled_residual") or 1.0)
     ),
+    # v = sqrt(e / 8) at least, for an error e of the stresses in the units of `coupled_residual`:
+    # dv = de / (16 v), see `Stress.take_residual`.
+    "velocity_error": lambda row: 1.0 / (16.0 * max(row["velocity_error"], 1e-4)),
     "max_divergence": lambda row: 32.0 * max(row["max_speed"], 0.1),
     # A difference of positions in float32, in a domain of about 1 m.
     "runout": lambda row: 1.0,

@@ -143,7 +143,7 @@ DENSITY = """
     particles = Particles(part.grid, position[mine], velocity[mine], affine=False)
     density, x = part.grid.field(), part.grid.origin[0]
     particles.sort()
-    density_of_all(part.grid, particles, part.grid.everywhere, full, density)
+    density_of_all(part.grid, None, particles, part.grid.everywhere, full, density)
     ours, whole = density.numpy()[1, 1:-1, 1:-1], expected.numpy()[1, 1:-1, 1:-1]
     assert ours.shape[1] > whole.shape[1] // 2
     np.testing.assert_allclose(ours, whole[:, x : x + ours.shape[1]], atol=1e-6)
