@@ -274,12 +274,12 @@ class SandSimulation(ParticleSimulation):
         the cells with sand, in units of rho g dx; velocity_error: estimate of the velocity's root
         mean square error, in units of g dt, see `Stress.take_residual`; solve_residual: relative to
         that at the start of the solve; staggering_iterations: iterations of the coupled method;
-        yielded, dissipation,
-        predicted_excess: see `SandReport.report`; front [m]: x up to which the deposit is connected
-        at the start of the step, see `deposit_front`; max_fraction: largest fraction of a cell at
-        the start of the step, relative to the densest packing; runout [m]: 99th percentile of x
-        less that at the start; height [m]: 99th percentile of y; flow_rate [kg/s; kg/(s m) in 2-D]:
-        mass below the gauge, or without a gauge the mass that left through drains and open sides.
+        yielded, dissipation, predicted_excess: see `SandReport.report`; front [m]: x up to which
+        the deposit is connected at the start of the step, see `deposit_front`; max_fraction:
+        largest fraction of a cell at the start of the step, relative to the densest packing; runout
+        [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y;
+        flow_rate [kg/s; kg/(s m) in 2-D]: mass below the gauge, or without a gauge the mass that
+        left through drains and open sides.
         """
         columns = tuple(
             name for name in COLUMNS if self.scene.output.diagnostics or name not in DIAGNOSTICS
