@@ -175,7 +175,7 @@ def make_viscosity(
     if scene.viscosity is None:
         return None
     tolerance = scene.solver.tolerance if scene.solver.tolerance != "auto" else VISCOUS_TOLERANCE
-    relative = scene.kept([*scene.liquid, *scene.source])
+    relative = scene.carried_numbers([*scene.liquid, *scene.source])
     return Viscosity(
         grid,
         boundary,

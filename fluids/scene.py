@@ -242,7 +242,7 @@ class LiquidScene(ParticleScene):
             for n, slip in slips
         ]
 
-    def kept(
+    def carried_numbers(
         self, materials: Sequence[MaterialProperties | SourceProperties]
     ) -> list[float] | None:
         """Return viscosities relative to `viscosity.value`; None if all are equal."""
@@ -453,7 +453,7 @@ class LiquidScene(ParticleScene):
             * (self.viscosity is not None)
             * (
                 VISCOUS_BYTES[self.dimension]
-                + MIXED_BYTES[self.dimension] * (self.kept(()) is not None)
+                + MIXED_BYTES[self.dimension] * (self.carried_numbers(()) is not None)
             ),
             "coupled solve": cells * self.couples * STOKES_BYTES[self.dimension],
             "bodies": cells * (BODY_BYTES * bool(motions) + POTENTIAL_BYTES * motions),

@@ -247,7 +247,7 @@ class GhostFluidSurface:
 
     def begin(self, window: Window) -> None:
         """Clear values of the last step outside of the window."""
-        self._window, self._measured = window.now, False
+        self._window, self._measured = window.current, False
         self.level_set.leave(window)
 
     def mark(self, particles: Particles, window: Window, kind: wp.array) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_lcp.granular.report_kernels import contact_kernel, report_pass, take_kernel
+from warp_lcp.granular.report_kernels import contact_kernel, report_pass, solved_velocity_kernel
 from warp_lcp.granular.stress import Stress
 from warp_lcp.grid.staggered import Window
 from warp_lcp.grid.window_reduction import WindowReduction
@@ -66,7 +66,7 @@ class SandReport:
                 field,
                 self.known[axis],
             ]
-            packing.grid.everywhere.launch(take_kernel, [axis, *fields])
+            packing.grid.everywhere.launch(solved_velocity_kernel, [axis, *fields])
         inputs = [wp.uint8(HELD), wp.uint8(RELEASED), packing.flags, stress.now, self.contact]
         packing.grid.domain.launch(contact_kernel, inputs)
 

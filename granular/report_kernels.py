@@ -33,7 +33,9 @@ def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> Stenci
 
 
 @cell_kernel("granular.report")
-def take_kernel(k, j, i, axis: int, base: I8, inverse: F32, found: F64, velocity: F32, known: I8):
+def solved_velocity_kernel(
+    k, j, i, axis: int, base: I8, inverse: F32, found: F64, velocity: F32, known: I8
+):
     """Set the velocity of a face that stresses act on, and mark it as known."""
     c, b, a = cell_below(axis, k, j, i)
     mark = wp.int8(0)

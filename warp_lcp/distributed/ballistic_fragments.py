@@ -47,13 +47,13 @@ class FragmentMerger:
 
         The rings at the domain's sides are included.
         """
-        known_box, place = self._part.known, 2 - axis
+        stored, place = self._part.stored_cells, 2 - axis
         first, planes = (
             self._part.owned.high[place] - 1 if side else self._part.owned.low[place],
             [],
         )
         for n in (first, first + 2 * side - 1):
-            low, high = list(known_box.low[::-1]), list(known_box.high[::-1])
+            low, high = list(stored.low[::-1]), list(stored.high[::-1])
             low[place], high[place] = n, n + 1
             planes.append(Window.of(low, high, self._part.grid.device))
         return planes

@@ -214,8 +214,8 @@ class Subdomain(GridPart):
 
         They are the cells of the box and the ring beyond the domain's sides.
         """
-        known = self.known
-        return Window.of(known.low[::-1], known.high[::-1], self.grid.device)
+        stored = self.stored_cells
+        return Window.of(stored.low[::-1], stored.high[::-1], self.grid.device)
 
     @property
     def first(self) -> tuple[int, int, int]:
@@ -296,7 +296,7 @@ class Subdomain(GridPart):
         """
         return {"box": np.array(self.corners), "counts": np.array(self.decomposition.counts)}
 
-    def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def checkpoint_fields(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return fields on the box, shape (..., nz, ny, nx); numbers are unchanged."""
         cells = fields_of(fields)
         return {
@@ -512,16 +512,16 @@ class Subdomain(GridPart):
         return cast(FieldT, field[(slice(None),) * (field.ndim - 3) + tuple(box)])
 
     @property
-    def known(self) -> CellBox:
+    def stored_cells(self) -> CellBox:
         """Stored cells that this rank owns.
 
         They are the cells of the box and the ring beyond the domain's sides.
         """
         return self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
 
-    def known_of(self, field: np.ndarray) -> np.ndarray:
+    def stored_view(self, field: np.ndarray) -> np.ndarray:
         """Return the view of a host field on the cells that this rank owns."""
-        return field[self.known.slices]
+        return field[self.stored_cells.slices]
 
     def stored_box_of(self, field: wp.array) -> wp.array:
         """Return the view of a field on the box and one cell around it.

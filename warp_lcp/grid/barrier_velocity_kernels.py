@@ -122,7 +122,7 @@ def constrain_kernel(
 
 
 @cell_kernel(MODULE)
-def take_kernel(k, j, i, number: I16, open: F32, result: F32, field: F32, known: I8):
+def copy_constrained_kernel(k, j, i, number: I16, open: F32, result: F32, field: F32, known: I8):
     """Copy the results of `constrain_kernel`, and mark those faces as unknown.
 
     Faces that solids cut must not use them any more.

@@ -461,4 +461,6 @@ class Barriers:
         for number, open_, result, field, mark in zip(
             self.number, opened, self._scratch, velocity, known, strict=True
         ):
-            window.launch(velocity_kernels.take_kernel, [number, open_, result, field, mark])
+            window.launch(
+                velocity_kernels.copy_constrained_kernel, [number, open_, result, field, mark]
+            )

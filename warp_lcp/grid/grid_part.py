@@ -307,7 +307,7 @@ class GridPart:
         low = np.array(self.grid.origin)
         return {} if self.grid.whole is None else {"box": np.array([low, low + self.grid.counts])}
 
-    def kept(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    def checkpoint_fields(self, fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return the arrays that a checkpoint of this process stores.
 
         Fields are cut to the part; numbers among them stay unchanged.
@@ -411,7 +411,7 @@ class GridPart:
         """Processes that share rows along x, in order; None if rows are whole."""
         return None
 
-    def known_of(self, field: np.ndarray) -> np.ndarray:
+    def stored_view(self, field: np.ndarray) -> np.ndarray:
         """Return the view of a host field on the cells that only this process stores."""
         return field
 

@@ -104,7 +104,7 @@ class LevelSet:
 
     def leave(self, window: Window) -> None:
         """Clear what the last update has written to another window."""
-        before, self._filled = self._filled, window.now
+        before, self._filled = self._filled, window.current
         if before is not None and (before.low, before.high) != (window.low, window.high):
             self._left.move_to(before)
             self._leaving.run(variant=before.near is None)

@@ -306,7 +306,7 @@ class Window(KeyedArgument):
         return self.low, self.high, None if self.near is None else object()
 
     @property
-    def now(self) -> "Window":
+    def current(self) -> "Window":
         """The window itself; of an `ActiveWindow` the window of the current step."""
         return self
 
@@ -394,7 +394,7 @@ class ActiveWindow(Window):
 
     def move_to(self, window: Window) -> None:
         """Set the window of the current step."""
-        window, before = window.now, self._now
+        window, before = window.current, self._now
         if window is before:
             return
         object.__setattr__(self, "_now", window)
@@ -514,7 +514,7 @@ class DirtyRegion:
 
         This window becomes the last. None stands for all cells.
         """
-        now, last = (window and window.now.common(self.all)) or self.all, self._last
+        now, last = (window and window.current.common(self.all)) or self.all, self._last
         self._last = now
         near = None if now.near is None or last.near is None else now.near | last.near
         return Window(

@@ -112,7 +112,7 @@ def zeros_like(field: DeviceArray) -> DeviceArray:
     return zeros(tuple(field.shape), field.dtype, field.device)
 
 
-def kept(host: np.ndarray, dtype: DataType, device: wp.Device) -> DeviceArray:
+def device_copy(host: np.ndarray, dtype: DataType, device: wp.Device) -> DeviceArray:
     """Return a copy of a host array on a device.
 
     On the CPU it is in NumPy's memory, as that of `zeros`.

@@ -302,7 +302,10 @@ def make_spray(
     ):
         return None
     return Spray(
-        coverage.domain, placed, side_bits(scene.domain.open), keeps=scene.kept(()) is not None
+        coverage.domain,
+        placed,
+        side_bits(scene.domain.open),
+        keeps=scene.carried_numbers(()) is not None,
     )
 
 
@@ -431,7 +434,7 @@ def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:
 
     Returns None if they carry none.
     """
-    kept = scene.kept(scene.materials()[1])
+    kept = scene.carried_numbers(scene.materials()[1])
     return None if kept is None else np.array([*kept, 1.0], dtype=np.float32)[owner]
 
 
@@ -456,7 +459,7 @@ def make_sources(
     """
     if not scene.source:
         return None
-    carried = scene.kept(scene.source)
+    carried = scene.carried_numbers(scene.source)
     sources = [
         Source(
             name=f"source[{number}] ({source.shape})",

@@ -134,7 +134,14 @@ class ParticleCheckpoints(ParticleFrames):
         }
         bodies = self.bodies.state() if self.bodies is not None else {}
         known = {"signature": signature(self.scene, self.grid)}
-        return clock | known | particles | part.kept(self._fields()) | bodies | part.where()
+        return (
+            clock
+            | known
+            | particles
+            | part.checkpoint_fields(self._fields())
+            | bodies
+            | part.where()
+        )
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`, on ranks that of one process; collective.

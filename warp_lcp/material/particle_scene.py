@@ -132,7 +132,7 @@ class ParticleScene(Scene):
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key of the material's shapes, such as `liquid`, and the shapes."""
 
-    def kept(
+    def carried_numbers(
         self, materials: Sequence[MaterialProperties | SourceProperties]
     ) -> list[float] | None:
         """Return the number that particles of each material or source carry; None if none."""
@@ -440,7 +440,9 @@ class ParticleScene(Scene):
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
         vectors = (
-            3 + (self.dimension if settings.transfer == "apic" else 0) + (self.kept(()) is not None)
+            3
+            + (self.dimension if settings.transfer == "apic" else 0)
+            + (self.carried_numbers(()) is not None)
         )
         correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {

@@ -19,7 +19,7 @@ from pyamg.aggregation.tentative import fit_candidates
 from pyamg.strength import symmetric_strength_of_connection
 
 from warp_lcp.kernels import BoundKernel, KernelFile, Rows
-from warp_lcp.kernels.fields import kept, zeros
+from warp_lcp.kernels.fields import device_copy, zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now
 from warp_lcp.kernels.types import DataType, DeviceArray
 from warp_lcp.multigrid.aggregates import aggregated, symmetric_part
@@ -52,8 +52,10 @@ class DeviceMatrix:
 
     def __init__(self, host: Matrix, real: DataType, device: wp.Device) -> None:
         self.shape, self.device = host.shape, device
-        self.indptr, self.indices = (kept(v, wp.int32, device) for v in (host.indptr, host.indices))
-        self.values = kept(host.data, real, device)
+        self.indptr, self.indices = (
+            device_copy(v, wp.int32, device) for v in (host.indptr, host.indices)
+        )
+        self.values = device_copy(host.data, real, device)
         self.rows, self.entries = (
             Rows.flat(self.shape[0], device),
             RowEntries(self.indptr, self.indices, self.values),

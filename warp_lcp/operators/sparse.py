@@ -18,7 +18,7 @@ from warp_lcp.kernels.fields import (
     check_kept,
     check_storable,
     checked_device,
-    kept,
+    device_copy,
     real_array,
     relative_rounding,
     zeros,
@@ -457,7 +457,8 @@ class SparseOperator(HostPickling):
         )
         turned = numbered.T.tocsr()
         parts = [
-            kept(v, wp.int32, self.device) for v in (turned.indptr, turned.indices, turned.data)
+            device_copy(v, wp.int32, self.device)
+            for v in (turned.indptr, turned.indices, turned.data)
         ]
         return parts[0], parts[1], parts[2]
 
