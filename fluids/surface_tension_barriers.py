@@ -6,7 +6,7 @@ import warp as wp
 from warp_lcp.fluids.surface_tension_kernels import BAND as SHARE
 from warp_lcp.fluids.surface_tension_kernels import distance_of
 from warp_lcp.grid.barrier_fields import has_neighbors, stand_in
-from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel, neighbor_offset
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 
 MODULE = "fluids.surface_tension_barriers"
@@ -42,15 +42,11 @@ def curvature_kernel(
             slope = wp.vec3()
             second = wp.mat33()
             for n in range(wp.where(planes == 2, 27, 9)):
-                di = n % 3 - 1
-                dj = (n // 3) % 3 - 1
-                dk = int(0)
-                if planes == 2:
-                    dk = n // 9 - 1
-                to = stand_in(apart, k, j, i, wp.vec3i(dk, dj, di))
+                offset = neighbor_offset(n, planes)
+                to = stand_in(apart, k, j, i, offset)
                 d = distance_of(k + to[0], j + to[1], i + to[2], once, twice, linear, cubic)
-                way = wp.vec3(float(di), float(dj), float(dk))
-                steps = wp.abs(di) + wp.abs(dj) + wp.abs(dk)
+                way = wp.vec3(float(offset[2]), float(offset[1]), float(offset[0]))
+                steps = wp.abs(offset[2]) + wp.abs(offset[1]) + wp.abs(offset[0])
                 if steps == 1:
                     slope += 0.5 * d * way
                     second += (d - here) * wp.outer(way, way)

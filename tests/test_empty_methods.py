@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from parsed_sources import parsed
+from parsed_sources import parsed, statements
 
 ROOT = Path(__file__).parent.parent
 # Class, or class and method: why a subclass may replace an empty method.
@@ -64,7 +64,7 @@ def overridden(trees: Iterable[ast.Module]) -> Iterator[str]:
     below: dict[str, set[str]] = defaultdict(set)
     protocols = set()
     for tree in trees:
-        for node in ast.walk(tree):
+        for node in statements(tree):
             if isinstance(node, ast.ClassDef):
                 bases = [ast.unparse(base).split("[")[0].split(".")[-1] for base in node.bases]
                 methods[node.name] |= {

@@ -7,6 +7,7 @@ import ast
 from pathlib import Path
 
 import warp_lcp
+from parsed_sources import parsed, statements
 
 ROOT = Path(warp_lcp.__file__).parent
 VIEWS = ("reshape", "ravel", "view", "T")
@@ -55,7 +56,7 @@ def pairs(node: ast.AST) -> list[tuple[ast.expr, ast.expr]]:
 def writes(function: ast.FunctionDef) -> bool:
     """Return whether a function writes to a result of `.numpy()`."""
     assigned = [
-        (node, target, value) for node in ast.walk(function) for target, value in pairs(node)
+        (node, target, value) for node in statements(function) for target, value in pairs(node)
     ]
     views = {
         t.id
@@ -78,9 +79,7 @@ def test_no_code_writes_to_a_host_copy_of_device_memory() -> None:
     found = set()
     for path in ROOT.rglob("*.py"):
         if "benchmarks" not in path.parts:
-            functions = [
-                f for f in ast.walk(ast.parse(path.read_text())) if isinstance(f, ast.FunctionDef)
-            ]
+            functions = [f for f in statements(parsed(path)) if isinstance(f, ast.FunctionDef)]
             found |= {f"{path.relative_to(ROOT)}:{f.name}" for f in functions if writes(f)}
     assert found == set(WRITES)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from parsed_sources import parsed
+from parsed_sources import inner_statements, parsed
 
 ROOT = Path(__file__).parent.parent
 PACKAGES = {
@@ -31,7 +31,7 @@ def modules() -> dict[str, Path]:
 
 def imported(node: ast.AST, names: dict[str, Path]) -> Iterator[str]:
     """Yield the modules that a module imports at run time, with their packages."""
-    for child in ast.iter_child_nodes(node):
+    for child in inner_statements(node):
         if isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
             continue
         if isinstance(child, ast.Import):

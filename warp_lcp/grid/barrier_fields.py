@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel, neighbor_offset
 from warp_lcp.grid.level_set_kernels import slope_beside
 
 MODULE = "warp_lcp.grid.barrier_fields"
@@ -92,15 +92,11 @@ def binomial_kernel(k, j, i, near: U8, apart: U8, planes: int, source: F32, out:
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         total = float(0.0)
         for n in range(wp.where(planes == 2, 27, 9)):
-            di = n % 3 - 1
-            dj = (n // 3) % 3 - 1
-            dk = int(0)
+            way = neighbor_offset(n, planes)
+            w = wp.where(way[2] == 0, 0.5, 0.25) * wp.where(way[1] == 0, 0.5, 0.25)
             if planes == 2:
-                dk = n // 9 - 1
-            w = wp.where(di == 0, 0.5, 0.25) * wp.where(dj == 0, 0.5, 0.25)
-            if planes == 2:
-                w *= wp.where(dk == 0, 0.5, 0.25)
-            step = stand_in(apart, k, j, i, wp.vec3i(dk, dj, di))
+                w *= wp.where(way[0] == 0, 0.5, 0.25)
+            step = stand_in(apart, k, j, i, way)
             total += w * source[k + step[0], j + step[1], i + step[2]]
         out[k, j, i] = total
 
@@ -117,13 +113,9 @@ def surrounded_kernel(k, j, i, near: U8, apart: U8, planes: int, inside: U8, aro
     if near[k, j, i] != wp.uint8(0) and has_neighbors(near, planes, k, j, i):
         result = wp.uint8(1)
         for n in range(wp.where(planes == 2, 27, 9)):
-            di = n % 3 - 1
-            dj = (n // 3) % 3 - 1
-            dk = int(0)
-            if planes == 2:
-                dk = n // 9 - 1
-            if inside[k + dk, j + dj, i + di] == wp.uint8(0):
-                if free_path(apart, k, j, i, dk, dj, di):
+            way = neighbor_offset(n, planes)
+            if inside[k + way[0], j + way[1], i + way[2]] == wp.uint8(0):
+                if free_path(apart, k, j, i, way[0], way[1], way[2]):
                     result = wp.uint8(0)
     around[k, j, i] = result
 

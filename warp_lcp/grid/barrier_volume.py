@@ -5,7 +5,7 @@ import warp as wp
 
 from warp_lcp.grid.barrier_fields import has_neighbors
 from warp_lcp.grid.barrier_geometry import CENTERS, INSIDE, Barrier, place_of, room_at, sees_from
-from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, U8, cell_kernel, neighbor_offset
 from warp_lcp.grid.level_set_kernels import slope_beside
 
 MODULE = "warp_lcp.grid.barrier_volume"
@@ -77,8 +77,8 @@ def filled_kernel(
         if room < reach:
             least = float(1.0)
             for n in range(wp.where(B.planes == 2, 27, 9)):
-                dk = wp.where(B.planes == 2, n // 9 - 1, 0)
-                least = wp.min(least, phi[k + dk, j + (n // 3) % 3 - 1, i + n % 3 - 1])
+                offset = neighbor_offset(n, B.planes)
+                least = wp.min(least, phi[k + offset[0], j + offset[1], i + offset[2]])
             total = float(0.0)
             count = wp.where(B.planes == 2, POINTS_3D, POINTS_2D)
             if least >= 0.0:
@@ -98,13 +98,11 @@ def filled_kernel(
                 else:
                     nearest = float(9.0)
                     for m in range(wp.where(B.planes == 2, 27, 9)):
-                        da = m % 3 - 1
-                        db = (m // 3) % 3 - 1
-                        dc = wp.where(B.planes == 2, m // 9 - 1, 0)
-                        to = way - wp.vec3(float(da), float(db), float(dc))
-                        c = k + dc
-                        b = j + db
-                        a = i + da
+                        offset = neighbor_offset(m, B.planes)
+                        to = way - wp.vec3(float(offset[2]), float(offset[1]), float(offset[0]))
+                        c = k + offset[0]
+                        b = j + offset[1]
+                        a = i + offset[2]
                         if (
                             m != wp.where(B.planes == 2, 13, 4)
                             and wp.length(to) < nearest

@@ -60,6 +60,15 @@ def cell_below(axis: int, k: int, j: int, i: int):
 
 
 @wp.func
+def neighbor_offset(n: int, planes: int):
+    """Return the offset (z, y, x) of neighbor n in the block of 3^dim cells around a cell.
+
+    Offsets count along x first; the middle one, 4 of 9 or 13 of 27, is the cell itself.
+    """
+    return wp.vec3i(wp.where(planes == 2, n // 9 - 1, 0), (n // 3) % 3 - 1, n % 3 - 1)
+
+
+@wp.func
 def next_to(axis: int, step: int, k: int, j: int, i: int):
     """Return the cell that is `step` cells further along an axis."""
     return (
