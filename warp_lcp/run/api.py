@@ -97,7 +97,7 @@ class Frame:
         `density` and `velocity` if the scene has them. Of volumes only the cells within the level
         set's band, or with a density or velocity other than 0, are included.
         """
-        found = {}
+        found: dict[str, meshio.Mesh] = {}
         for part in self.parts():
             members = part.volumes if isinstance(part, VolumeGroup) else (part,)
             found |= {member.name: to_meshio(member) for member in members}
