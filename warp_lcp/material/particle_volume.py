@@ -11,6 +11,7 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.simulation import Volume
 
 VOLUME_BYTES = 13  # fields of the level set, per cell
+VELOCITY_BYTES = 60  # points, velocities and faces while a frame is measured, per cell, at most
 
 
 class ParticleVolume:
