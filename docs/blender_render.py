@@ -1,11 +1,11 @@
-"""Render a run with Blender's Cycles, from a file of `warp-lcp export` or an OpenVDB frame.
+r"""Render a run with Blender's Cycles, from a file of `warp-lcp export` or an OpenVDB frame.
 
     # Blender as a module, 5.0.1 for Python 3.11; in an environment of its own
     pip install bpy "numpy<2"
     warp-lcp export out/dam-break --out dam.usdc  # or dam.abc
-    python docs/blender_render.py dam.usdc dam.png --frame 12 --position 2.4 1.6 2.8 \\
+    python docs/blender_render.py dam.usdc dam.png --frame 12 --position 2.4 1.6 2.8 \
         --look-at 0.8 0.15 0.4
-    python docs/blender_render.py out/dam-break/frames/volume_000012.vdb fog.png \\
+    python docs/blender_render.py out/dam-break/frames/volume_000012.vdb fog.png \
         --position 2.4 1.6 2.8 --look-at 0.8 0.15 0.4
 
 Positions are those of the scene [m], y up.

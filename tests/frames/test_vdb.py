@@ -4,13 +4,14 @@ TinyVDB 0.9 reads neither vectors of 16 bits nor the places of leaves beyond 64 
 own files either: it sees small scalar grids.
 """
 
+import json
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from film_tools import openvdb
+from film_tools import blender, openvdb
 from warp_lcp.frames.frame_folder import FrameFolder, frame_bytes
 from warp_lcp.frames.vdb import GRID_NAMES, HALF, write_vdb
 from warp_lcp.frames.voxel_tree import LARGEST, LEAF
@@ -79,6 +80,31 @@ def test_openvdb_reads_every_voxel(tmp_path, shape):
     classes = [vdb.read(str(tmp_path / "a.vdb"), name).gridClass for name in ("surface", "density")]
     assert classes == [vdb.GridClass.LEVEL_SET, vdb.GridClass.FOG_VOLUME]
     assert vdb.read(str(tmp_path / "a.vdb"), "velocity").vectorType == "contravariant relative"
+
+
+IN_BLENDER = """
+import json, sys
+import bpy
+bpy.ops.object.volume_import(filepath=sys.argv[1], files=[{"name": "a.vdb"}])
+item = bpy.context.object
+item.data.grids.load()
+grids = [[grid.name, grid.data_type] for grid in item.data.grids]
+low, high = list(item.bound_box[0]), list(item.bound_box[6])
+print("FOUND" + json.dumps([grids, low, high, item.data.grids.error_message]))
+"""
+
+
+def test_blender_opens_it(tmp_path):
+    volumes = group(SMALL)
+    write_vdb(tmp_path / "a.vdb", volumes)
+    text = blender(IN_BLENDER, tmp_path / "a.vdb")
+    grids, low, high, error = json.loads(text[text.index("FOUND") + 5 :].splitlines()[0])
+    assert dict(grids) == {"surface": "FLOAT", "density": "FLOAT", "velocity": "VECTOR_FLOAT"}
+    assert error == ""
+    active = np.argwhere(is_active(volumes.volumes[2]))[:, ::-1]
+    first = (active.min(axis=0) + np.array(ORIGIN)) * SPACING
+    last = (active.max(axis=0) + 1 + np.array(ORIGIN)) * SPACING
+    np.testing.assert_allclose([low, high], [first, last], atol=LEAF * SPACING)
 
 
 def test_tinyvdb_reads_scalars(tmp_path):
