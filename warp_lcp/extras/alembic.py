@@ -31,7 +31,6 @@ if TYPE_CHECKING:
         OFloatGeomParam,
         OFloatGeomParamSample,
         OObject,
-        OPoints,
         OPolyMesh,
         OXform,
     )
@@ -40,6 +39,7 @@ SUFFIXES = (".abc",)
 CLOSING_BYTES = 2**16, 2**11  # written when an archive is closed, at most: in all, and per frame
 STATIC = 0  # number of the time sampling of what does not move
 MOST_IDS = 2**31
+NUMBERS = ("age",)  # fields of points that are written, one number a point
 ArrayT = TypeVar("ArrayT")
 
 
@@ -75,25 +75,25 @@ class AlembicArchive:
 
     def __init__(self, folder: Path, recording: Recording, numbers: Sequence[int]) -> None:
         """Write the data that all frames share."""
-        from alembic3d import Abc, AbcGeom
+        from alembic3d import Abc
 
         scene = recording.scene
         self._recording, self._dimension, self._time = recording, scene.dimension, scene.time
         self._file, self._reserve = folder / "frames.abc", folder / "reserve"
         self._reserve.write_bytes(bytes(CLOSING_BYTES[0] + CLOSING_BYTES[1] * len(numbers)))
-        self._spacing = recording.particle_spacing()
         self._line_width = LINE_WIDTH * scene.spacing
         rate = scene.time.frames_per_second
         self._archive = Abc.CreateArchiveWithInfo(str(self._file), rate, "warp_lcp", str(folder))
         self._samples = self._archive.addTimeSampling(_sampling(recording, numbers))
         self._top = self._archive.getTop()
         self._surface: OPolyMesh | OCurves | None = None
-        self._particles: OPoints | None = None
-        self._age: OFloatGeomParam | None = None
+        self._particles: PointsObject | None = None
         if recording.show in WITH_SURFACE:
             self._surface = self._shape(self._top, "surface", self._samples)
         if recording.show in WITH_PARTICLES:
-            self._particles = AbcGeom.OPoints(self._top, "particles", self._samples)
+            self._particles = PointsObject(
+                self._top, "particles", self._samples, recording.particle_spacing()
+            )
         self._static: list[OPolyMesh | OCurves] = []  # shapes that are closed with the archive
         self._moving = self._solids()
         self._bodies: dict[int, tuple[np.ndarray, OXform]] = {}
@@ -118,7 +118,7 @@ class AlembicArchive:
             normals = vertex_normals(surface) if self._dimension == 3 else None
             self._set_shape(self._surface, surface.points, surface.corners, velocity, normals)
         if self._particles is not None:
-            self._set_particles(self._recording.particles(number))
+            self._particles.set(self._recording.particles(number))
         self._set_bodies(number)
         for motion, place in self._moving:
             pose = motion.pose(self._time.frame_time(number))
@@ -128,7 +128,7 @@ class AlembicArchive:
     def saved_as(self, suffix: str) -> Path:
         """Close the archive; return its file."""
         self._reserve.unlink()
-        self._surface = self._particles = self._age = self._top = self._archive = None
+        self._surface = self._particles = self._top = self._archive = None
         self._moving, self._bodies, self._static = [], {}, []
         gc.collect()
         return self._file
@@ -136,7 +136,8 @@ class AlembicArchive:
     def _leak(self) -> None:
         """Keep all objects until the process ends, since closing would abort it."""
         places = [place for _, place in (*self._moving, *self._bodies.values())]
-        objects = (self._surface, self._particles, self._age, self._top, self._archive)
+        points = () if self._particles is None else self._particles.objects
+        objects = (self._surface, *points, self._top, self._archive)
         for one in (*objects, *places, *self._static):
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(one))
 
@@ -219,30 +220,60 @@ class AlembicArchive:
             sample.setVelocities(held.vectors(velocity))
         shape.getSchema().set(sample)
 
-    def _set_particles(self, particles: Points) -> None:
-        """Add a sample of particles; ids and ages [s] are those of the frame, if it has them."""
+
+class PointsObject:
+    """Points of an archive, such as particles.
+
+    Args:
+        parent: object above it.
+        name: name of the object.
+        samples: number of its time sampling.
+        width: width of the points [m].
+    """
+
+    def __init__(self, parent: OObject, name: str, samples: int, width: float) -> None:
         from alembic3d import AbcGeom
 
-        assert self._particles is not None
-        ids = particles.fields.get("id", np.arange(len(particles.points))).ravel()
+        self._samples, self._width = samples, width
+        self._points = AbcGeom.OPoints(parent, name, samples)
+        self._numbers: dict[str, OFloatGeomParam] = {}
+
+    @property
+    def objects(self) -> tuple[object, ...]:
+        """Alembic's objects, which write when they are closed."""
+        return self._points, *self._numbers.values()
+
+    def set(self, points: Points) -> None:
+        """Add a sample: positions [m], ids, velocities [m/s] and numbers of a frame, if it has them.
+
+        Ids are the numbers of the points in a frame without `id`. A number that the first frame
+        lacks is not written.
+
+        Raises:
+            RenderError: an id has more than 31 bits.
+        """
+        from alembic3d import AbcGeom
+
+        ids = points.fields.get("id", np.arange(len(points.points))).ravel()
         if len(ids) and ids.max() >= MOST_IDS:
             raise RenderError(f"ids of particles exceed {MOST_IDS - 1}: export USD")
         order = np.argsort(ids, kind="stable")  # programs pair points of two frames by their index
         held = HeldArrays()
-        positions, numbers = held.vectors(particles.points[order]), held.integers(ids[order])
+        positions, numbers = held.vectors(points.points[order]), held.integers(ids[order])
         sample = AbcGeom.OPointsSchemaSample(positions, numbers)
-        sample.setWidths(held.constant(self._spacing))
-        if (velocity := particles.fields.get("velocity")) is not None:
+        sample.setWidths(held.constant(self._width))
+        if (velocity := points.fields.get("velocity")) is not None:
             sample.setVelocities(held.vectors(velocity[order]))
-        schema = self._particles.getSchema()
+        schema, scope = self._points.getSchema(), AbcGeom.GeometryScope.kVaryingScope
+        is_first = schema.getNumSamples() == 0
         schema.set(sample)
-        if (age := particles.fields.get("age")) is not None:
-            scope = AbcGeom.GeometryScope.kVaryingScope
-            if self._age is None:
-                arguments = (schema.getArbGeomParams(), "age", False, scope, 1, self._samples)
-                self._age = AbcGeom.OFloatGeomParam(*arguments)
-            values = held.floats(np.asarray(age).ravel()[order])
-            self._age.set(AbcGeom.OFloatGeomParamSample(values, scope))
+        if is_first:
+            for name in (name for name in NUMBERS if name in points.fields):
+                arguments = (schema.getArbGeomParams(), name, False, scope, 1, self._samples)
+                self._numbers[name] = AbcGeom.OFloatGeomParam(*arguments)
+        for name, param in self._numbers.items():
+            values = np.asarray(points.fields.get(name, np.zeros(len(ids)))).ravel()
+            param.set(AbcGeom.OFloatGeomParamSample(held.floats(values[order]), scope))
 
 
 def _sampling(recording: Recording, numbers: Sequence[int]) -> object:
