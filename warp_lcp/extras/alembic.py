@@ -244,7 +244,7 @@ class PointsObject:
         return self._points, *self._numbers.values()
 
     def set(self, points: Points) -> None:
-        """Add a sample: positions [m], ids, velocities [m/s] and numbers of a frame, if it has them.
+        """Add a sample: positions [m], ids, velocities [m/s] and numbers that the frame has.
 
         Ids are the numbers of the points in a frame without `id`. A number that the first frame
         lacks is not written.
