@@ -1,8 +1,12 @@
-"""Render a run with Blender's Cycles, from the USD file of `warp-lcp export`.
+r"""Render a run with Blender's Cycles, from a file of `warp-lcp export` or an OpenVDB frame.
 
-    pip install bpy "numpy<2" # Blender as a module, 5.0.1 for Python 3.11; in an environment of its
-    own warp-lcp export out/floating-bodies --out bodies.usdc python docs/blender_render.py
-    bodies.usdc bodies.png --frame 40 --position 2.4 1.6 2.8 --look-at 0.8 0.15 0.4
+    # Blender as a module, 5.0.1 for Python 3.11; in an environment of its own
+    pip install bpy "numpy<2"
+    warp-lcp export out/dam-break --out dam.usdc  # or dam.abc
+    python docs/blender_render.py dam.usdc dam.png --frame 12 --position 2.4 1.6 2.8 \
+        --look-at 0.8 0.15 0.4
+    python docs/blender_render.py out/dam-break/frames/volume_000012.vdb fog.png \
+        --position 2.4 1.6 2.8 --look-at 0.8 0.15 0.4
 
 Positions are those of the scene [m], y up.
 """
@@ -22,7 +26,10 @@ ABSORPTION = (1.6, 0.47, 0.26)
 # of water: shadow rays go straight on, so that what lies below it needs no caustics
 SHADOW = (0.82, 0.92, 0.95, 1.0)
 FLOOR, BODIES = (0.6, 0.6, 0.6), [(0.75, 0.24, 0.06), (0.85, 0.62, 0.08), (0.10, 0.35, 0.12)]
+PARTICLES = (0.06, 0.25, 0.55)
 GLASS_BOUNCES = 16
+FOG_DENSITY = 60.0  # of the volume where the relative density is 1, 1/m
+FAST = 2.5  # speed that is white [m/s]
 
 
 def z_up(point: tuple[float, float, float]) -> mathutils.Vector:
@@ -55,6 +62,63 @@ def water() -> Any:
     tree.links.new(mix.outputs[0], output.inputs["Surface"])
     tree.links.new(absorption.outputs[0], output.inputs["Volume"])
     return material
+
+
+def fog() -> Any:
+    """Return a material of the grids `density` and `velocity`: fast liquid is white."""
+    material = bpy.data.materials.new("fog")
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    volume, output = (
+        tree.nodes.new("ShaderNodeVolumePrincipled"),
+        tree.nodes.new("ShaderNodeOutputMaterial"),
+    )
+    density, velocity = (tree.nodes.new("ShaderNodeAttribute") for _ in range(2))
+    density.attribute_name, velocity.attribute_name = "density", "velocity"
+    thick, speed, colors = (
+        tree.nodes.new("ShaderNodeMath"),
+        tree.nodes.new("ShaderNodeVectorMath"),
+        tree.nodes.new("ShaderNodeValToRGB"),
+    )
+    share = tree.nodes.new("ShaderNodeMath")
+    thick.operation, share.operation, speed.operation = "MULTIPLY", "DIVIDE", "LENGTH"
+    thick.inputs[1].default_value, share.inputs[1].default_value = FOG_DENSITY, FAST
+    colors.color_ramp.elements[0].color = (0.03, 0.16, 0.45, 1.0)
+    colors.color_ramp.elements[1].color = (0.9, 0.95, 1.0, 1.0)
+    volume.inputs["Density Attribute"].default_value = ""
+    tree.links.new(density.outputs["Fac"], thick.inputs[0])
+    tree.links.new(thick.outputs[0], volume.inputs["Density"])
+    tree.links.new(velocity.outputs["Vector"], speed.inputs[0])
+    tree.links.new(speed.outputs["Value"], share.inputs[0])
+    tree.links.new(share.outputs[0], colors.inputs[0])
+    tree.links.new(colors.outputs[0], volume.inputs["Color"])
+    tree.links.new(volume.outputs[0], output.inputs["Volume"])
+    return material
+
+
+def load(scene: Any, options: argparse.Namespace) -> None:
+    """Import the file, with materials, and go to the frame."""
+    file, kind = str(options.file.resolve()), options.file.suffix.lower()
+    if kind == ".vdb":
+        bpy.ops.object.volume_import(filepath=file, files=[{"name": options.file.name}])
+        volume = bpy.context.object
+        volume.rotation_euler, volume.location = (math.radians(90.0), 0.0, 0.0), (0.0, 0.0, 0.0)
+        volume.data.materials.append(fog())
+        return
+    if kind == ".abc":
+        bpy.ops.wm.alembic_import(filepath=file, as_background_job=False)
+    else:
+        bpy.ops.wm.usd_import(filepath=file)
+    scene.frame_set(options.frame)
+    for item in (item for item in scene.objects if item.type == "POINTCLOUD"):
+        item.data.materials.append(matte("particles", PARTICLES))
+    for number, item in enumerate(item for item in scene.objects if item.type == "MESH"):
+        item.data.materials.clear()
+        color = BODIES[number % len(BODIES)]
+        item.data.materials.append(
+            water() if item.name.startswith("surface") else matte(item.name, color)
+        )
 
 
 def matte(name: str, color: tuple[float, float, float]) -> Any:
@@ -117,11 +181,11 @@ def settings(scene: Any, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Import, light and render one frame."""
+    """Load, light and render one frame."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("usd", type=Path)
+    parser.add_argument("file", type=Path)
     parser.add_argument("picture", type=Path)
     parser.add_argument("--frame", type=int, default=0)
     parser.add_argument("--position", type=float, nargs=3, required=True)
@@ -132,14 +196,7 @@ def main() -> None:
     options = parser.parse_args()
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    bpy.ops.wm.usd_import(filepath=str(options.usd.resolve()))
-    scene.frame_set(options.frame)
-    for number, item in enumerate(item for item in scene.objects if item.type == "MESH"):
-        item.data.materials.clear()
-        color = BODIES[number % len(BODIES)]
-        item.data.materials.append(
-            water() if item.name.startswith("surface") else matte(item.name, color)
-        )
+    load(scene, options)
     studio(scene, max(max(item.dimensions) for item in scene.objects))
     camera(scene, options)
     settings(scene, options)

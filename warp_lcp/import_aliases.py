@@ -34,7 +34,7 @@ MODULES = {
     "warp_lcp.problem.spare_workspace": "warp_lcp.problem.workspace_cache",
     "warp_lcp.qp": "warp_lcp.extras.qp",
     "warp_lcp.render.live": "warp_lcp.extras.live",
-    "warp_lcp.render.usd": "warp_lcp.extras.usd",
+    "warp_lcp.render.usd": "warp_lcp.extras.export",
     "warp_lcp.render.viewer": "warp_lcp.extras.viewer",
 }
 """The module that each older name stands for."""

@@ -172,7 +172,7 @@ class Volume:
 
     Args:
         name: first part of the names of its files.
-        values: float32, shape (nz, ny, nx).
+        values: float32, shape (nz, ny, nx); vectors (nz, ny, nx, 3) only in a `VolumeGroup`.
         spacing: of the cells [m].
         band: for a signed distance, < 0 inside: distance from the surface up to which it is known
             [m]. None for a density, >= 0.
@@ -186,7 +186,20 @@ class Volume:
     origin: tuple[int, int, int] = (0, 0, 0)
 
 
-Part = Points | Cells | Surface | Volume  # of a frame
+@dataclass(frozen=True)
+class VolumeGroup:
+    """A frame of several volumes in one file.
+
+    Args:
+        name: first part of the names of its files.
+        volumes: values of one grid.
+    """
+
+    name: str
+    volumes: tuple[Volume, ...]
+
+
+Part = Points | Cells | Surface | Volume | VolumeGroup  # of a frame
 
 
 class Simulation(Protocol):

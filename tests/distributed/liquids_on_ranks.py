@@ -6,6 +6,7 @@
 import json
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from unittest.mock import patch
 
@@ -29,7 +30,7 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_simulation import ParticleSimulation
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.simulator import simulators
-from warp_lcp.simulation import SimulationFailed, StepFailed
+from warp_lcp.simulation import SimulationFailed, StepFailed, Volume, VolumeGroup
 
 viscosity_multigrid.GATHERED = 1024  # small enough that some levels stay distributed
 EAGER = Balance(every=2, bound=1.0, fixed=0.0)  # repartitions whenever other boxes are better
@@ -470,7 +471,17 @@ WRAPPED = {
     | {"output": {"surface": True, "surface_resolution": 1}, "resolution": 40},
     "heap": HEAP | {"output": {"surface": True}},
     "fine": SCENES["cut"] | {"output": {"surface": True, "surface_smoothing": 2.0, "volume": True}},
+    "moving": SCENES["cut"] | {"output": {"surface": True, "volume": True, "volume_format": "vdb"}},
 }
+
+
+def single_volumes(parts: Sequence[Volume | VolumeGroup]) -> list[Volume]:
+    """Return the volumes of a frame, those of groups too."""
+    return [
+        volume
+        for part in parts
+        for volume in (part.volumes if isinstance(part, VolumeGroup) else (part,))
+    ]
 
 
 def wrap(ranks: Ranks, folder: Path) -> None:
@@ -487,7 +498,9 @@ def wrap(ranks: Ranks, folder: Path) -> None:
             ]
             if ranks.is_root:
                 mesh = one_mesh(pieces)
-                found = {volume.name: volume.values for volume in volumes} | mesh.fields
+                found = {
+                    f"volume_{volume.name}": volume.values for volume in single_volumes(volumes)
+                } | mesh.fields
                 np.savez(
                     folder / f"{name}_{step}_{ranks.size}.npz",
                     points=mesh.points,

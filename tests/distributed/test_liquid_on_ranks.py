@@ -21,6 +21,7 @@ from liquids_on_ranks import (
     advance,
     model,
     scene,
+    single_volumes,
     sponge,
 )
 from ranks_in_turn import RankInTurn
@@ -248,8 +249,10 @@ def test_ranks_have_the_surface_and_the_volumes_of_one_process(mpi, tmp_path, ra
             advance(simulation, 2 * step)
             _, _, expected, *volumes = simulation.frame()
             found = np.load(tmp_path / f"{name}_{step}_{ranks}.npz")
-            for volume in volumes:
-                np.testing.assert_allclose(found[volume.name], volume.values, atol=1e-6 * step)
+            for volume in single_volumes(volumes):
+                atol = (1e-4 if volume.name == "velocity" else 1e-6) * step
+                values = found[f"volume_{volume.name}"]
+                np.testing.assert_allclose(values, volume.values, atol=atol)
             order, other = (np.lexsort(part.T) for part in (found["points"], expected.points))
             velocity = expected.fields["velocity"]
             if step == 0:

@@ -12,7 +12,7 @@ from command_line import invoke
 from mesh_checks import assert_closed, enclosed
 from small_liquids import GRAVITY, scene
 from small_runs import ball, box, run_into, write_run
-from warp_lcp.extras.usd import INSTALL, export_run, usd_suffix
+from warp_lcp.extras.export import export_format, export_run
 from warp_lcp.frames.frame_folder import FrameFolder
 from warp_lcp.render.image_content import RenderError, VisiblePart
 from warp_lcp.simulation import Points, Surface
@@ -373,7 +373,7 @@ def test_the_end_of_a_run_may_lie_between_two_frames(dots, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["run", "--out", "a.abc"], "--out a.abc: must end in .usdc, .usda or .usd"),
+        (["run", "--out", "a.obj"], "--out a.obj: must end in .usdc, .usda, .usd or .abc"),
         (["run", "--out", "folder.usd"], "--out folder.usd: is a folder; name a file"),
         (
             ["nowhere", "--out", "a.usdc"],
@@ -431,11 +431,11 @@ def test_without_usd_the_command_says_what_to_install(dots, tmp_path, monkeypatc
     monkeypatch.setitem(sys.modules, "pxr", None)
     result = invoke("export", folder, "--out", tmp_path / "run.usdc")
     assert result.exit_code == 2
-    assert INSTALL in " ".join(result.stderr.split())
+    assert "pip install 'warp-lcp[usd]'" in " ".join(result.stderr.split())
 
 
 def test_frames_of_a_run_at_work_are_those_that_are_there(dots, tmp_path):
     folder = write_run(tmp_path / "run", [[ball([0.5, 0.5], 0.2)]] * 2)
     FrameFolder(folder).write(2, 0.1, [ball([0.6, 0.5], 0.2)])
     assert exported(folder, tmp_path / "run.usdc").GetEndTimeCode() == 2.0
-    assert usd_suffix(tmp_path / "a.USDC") == ".usdc"
+    assert export_format(tmp_path / "a.USDC").name == "USD"

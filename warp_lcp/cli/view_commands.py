@@ -309,7 +309,9 @@ def export(
     out: Annotated[
         Path,
         typer.Option(
-            metavar="FILE", help="USD file: .usdc, .usda (text) or .usd.", show_default=False
+            metavar="FILE",
+            help="File: .usdc, .usda (text) or .usd for USD, .abc for Alembic.",
+            show_default=False,
         ),
     ],
     show: ShowOption = None,
@@ -326,11 +328,11 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write a run to one USD file, for Blender, Houdini and Maya.
+    """Write a run to one USD or Alembic file, for Blender, Houdini and Maya.
 
-    Needs the extra `usd`.
+    Needs the extra `usd` or `alembic`.
     """
-    from warp_lcp.extras.usd import export_run
+    from warp_lcp.extras.export import export_run
     from warp_lcp.run.progress import ProgressCounter
 
     devices()

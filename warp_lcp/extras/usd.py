@@ -1,22 +1,21 @@
-"""Export a run's frames as one USD file, for Blender, Houdini and Maya.
+"""USD stages of a run's frames.
 
 Needs the extra `usd`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from warp_lcp.files.atomic import make_folder, replacing_by_name
 from warp_lcp.grid.motion import Motion
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
-from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE, RenderError, VisiblePart
+from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE
 from warp_lcp.render.recording import Recording
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
@@ -26,92 +25,26 @@ from warp_lcp.simulation import Surface
 if TYPE_CHECKING:
     from pxr import Gf, Usd, UsdGeom, Vt
 
-INSTALL = "pip install 'warp-lcp[usd]'"
 TEXT = ".usda"
 SUFFIXES = (".usdc", TEXT, ".usd")
 LINE_WIDTH = 0.1  # of outlines in 2-D, in cells
 DISPLAY_GAMMA = 2.2  # colors of USD are linear
 
 
-def export_run(
-    folder: Path,
-    file: Path,
-    *,
-    show: VisiblePart | None = None,
-    first: int | None = None,
-    last: int | None = None,
-    on_progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Iterator[int]:
-    """Write frames of a run into a USD file; yield the number of each written frame.
-
-    A time code is the number of a frame; y is up, lengths are in meters, velocities in meters per
-    second. The file is created when it is complete.
-
-    Args:
-        folder: folder of the run.
-        file: `.usdc` and `.usd` are binary, `.usda` is text.
-        show: part of the material to write; see `Recording`.
-        first: number of the first frame. Default: that of the run.
-        last: number of the last frame.
-        on_progress: called with the number of written frames, and the total number.
+def load() -> type[Exception]:
+    """Import USD; return the type of its errors.
 
     Raises:
-        RenderError: USD is missing, there are no such frames, or the file cannot be written.
-        SceneError: the run's scene cannot be read.
+        ImportError: it is not installed.
     """
-    suffix = usd_suffix(file)
-    try:
-        from pxr import Tf, Usd, UsdGeom  # noqa: F401
-    except ImportError as error:
-        raise RenderError(
-            f"export needs USD, which cannot be loaded ({error}): {INSTALL}"
-        ) from error
-    recording = Recording(folder, show=show)
-    numbers = [
-        number
-        for number in recording.numbers
-        if (first is None or first <= number) and (last is None or number <= last)
-    ]
-    if not numbers:
-        requested = " ".join(
-            f"--{name} {number}"
-            for name, number in (("first", first), ("last", last))
-            if number is not None
-        )
-        raise RenderError(
-            f"{requested}: there are no such frames; the run has {recording.numbers[0]} to "
-            f"{recording.numbers[-1]}"
-        )
-    try:
-        make_folder(file.parent)
-        with TemporaryDirectory(prefix=f".{file.name}.", dir=file.parent) as scratch:
-            stage = UsdStage(Path(scratch) / "frames.usdc", recording, numbers)
-            on_progress(0, len(numbers))
-            for done, number in enumerate(numbers, 1):
-                stage.add(number)
-                on_progress(done, len(numbers))
-                yield number
-            whole = stage.saved_as(suffix)
-            with replacing_by_name(file) as temporary:
-                whole.replace(temporary)
-    except (OSError, Tf.ErrorException) as error:
-        # Of the first error.
-        why = error.strerror if isinstance(error, OSError) else error.args[0].commentary
-        raise RenderError(f"{file}: cannot be written: {why}") from error
+    from pxr import Tf, Usd, UsdGeom  # noqa: F401
+
+    return cast(type[Exception], Tf.ErrorException)
 
 
-def usd_suffix(file: Path) -> str:
-    """Return the suffix of a USD file.
-
-    Raises:
-        RenderError: it is not a suffix of USD, or the file is a folder.
-    """
-    suffix = file.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise RenderError(f"--out {file}: must end in {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    if file.is_dir():
-        raise RenderError(f"--out {file}: is a folder; name a file")
-    return suffix
+def cause(error: Exception) -> str:
+    """Return the reason in an error of USD."""
+    return str(error.args[0].commentary)
 
 
 class UsdStage:
@@ -120,16 +53,16 @@ class UsdStage:
     Frames that have been added are on the disk.
 
     Args:
-        crate: the new file, `.usdc`.
+        folder: folder for the new file.
         recording: frames of the run.
         numbers: numbers of the frames to add.
     """
 
-    def __init__(self, crate: Path, recording: Recording, numbers: Sequence[int]) -> None:
+    def __init__(self, folder: Path, recording: Recording, numbers: Sequence[int]) -> None:
         """Write the data that all frames share."""
         from pxr import Tf, Usd, UsdGeom
 
-        scene = recording.scene
+        scene, crate = recording.scene, folder / "frames.usdc"
         self._crate, self._recording, self._dimension = crate, recording, scene.dimension
         self._time, self._rate, self._always = (
             scene.time,
@@ -221,20 +154,14 @@ class UsdStage:
 
     def _set_bodies(self, bodies: Surface, code: float) -> None:
         """Place rigid bodies; each shape is stored once, relative to its center."""
-        of_point = np.asarray(bodies.fields["body"]).ravel()
-        for body in np.unique(of_point):
-            of_body = of_point == body
-            middle = bodies.points[of_body].mean(axis=0)
-            points = bodies.points[of_body] - middle
-            if body not in self._bodies:
-                shape = self._shape(f"body_{body}", BODY_COLORS[body % len(BODY_COLORS)])
-                corners = bodies.corners[of_body[bodies.corners[:, 0]]]
-                self._set_shape(shape, points, (np.cumsum(of_body) - 1)[corners], self._always)
-                self._bodies[body] = points, shape.AddTransformOp()
-            at_first, place = self._bodies[body]
-            place.Set(
-                _matrix(Rotation.align_vectors(points, at_first)[0].as_matrix(), middle), code
-            )
+        for one in split_bodies(bodies):
+            if one.number not in self._bodies:
+                color = BODY_COLORS[one.number % len(BODY_COLORS)]
+                shape = self._shape(f"body_{one.number}", color)
+                self._set_shape(shape, one.points, one.corners, self._always)
+                self._bodies[one.number] = one.points, shape.AddTransformOp()
+            at_first, place = self._bodies[one.number]
+            place.Set(_matrix(one.rotation_from(at_first), one.middle), code)
 
     def _shape(self, name: str, color: str) -> UsdGeom.Mesh | UsdGeom.BasisCurves:
         """Define a mesh of triangles, in 2-D curves of one segment each."""
@@ -333,6 +260,38 @@ def _integers(values: np.ndarray) -> Vt.IntArray:
     from pxr import Vt
 
     return Vt.IntArray.FromNumpy(np.ascontiguousarray(values, dtype=np.int32))
+
+
+@dataclass(frozen=True)
+class PlacedBody:
+    """Surface of a rigid body in a frame.
+
+    Args:
+        number: number of the body.
+        points: positions relative to the middle [m], shape (n, 3).
+        corners: indices of points, shape (m, 3), in 2-D (m, 2).
+        middle: mean of the positions [m].
+    """
+
+    number: int
+    points: np.ndarray
+    corners: np.ndarray
+    middle: np.ndarray
+
+    def rotation_from(self, at_first: np.ndarray) -> np.ndarray:
+        """Return the rotation, a matrix, from points of an earlier frame to these."""
+        return np.asarray(Rotation.align_vectors(self.points, at_first)[0].as_matrix())
+
+
+def split_bodies(bodies: Surface) -> Iterator[PlacedBody]:
+    """Yield the rigid bodies of a frame."""
+    of_point = np.asarray(bodies.fields["body"]).ravel()
+    for body in np.unique(of_point):
+        of_body = of_point == body
+        middle = bodies.points[of_body].mean(axis=0)
+        corners = bodies.corners[of_body[bodies.corners[:, 0]]]
+        of_points = (np.cumsum(of_body) - 1)[corners]
+        yield PlacedBody(int(body), bodies.points[of_body] - middle, of_points, middle)
 
 
 def _matrix(rotation: np.ndarray, translation: np.ndarray) -> Gf.Matrix4d:

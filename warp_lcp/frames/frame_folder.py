@@ -1,4 +1,4 @@
-"""Frames of a run: VTU, VTI, NanoVDB and PLY files, and PVD collections.
+"""Frames of a run: VTU, VTI, NanoVDB, OpenVDB and PLY files, and PVD collections.
 
 PVD collections list files with their times, for ParaView. Formats of meshio have no collection:
 ParaView opens numbered files as a series.
@@ -27,13 +27,23 @@ from warp_lcp.frames.meshio_format import (
 from warp_lcp.frames.nvdb import nvdb_bytes, write_nvdb
 from warp_lcp.frames.pieces import WHOLE, in_ranks, piece_files
 from warp_lcp.frames.ply import ply_bytes, write_ply
+from warp_lcp.frames.vdb import vdb_bytes, write_vdb
 from warp_lcp.frames.vti import vti_bytes, write_vti
 from warp_lcp.frames.vtu import vtu_bytes, write_vtu
-from warp_lcp.simulation import Cells, NoStopwatch, Part, Points, Stopwatch, Surface, Volume
+from warp_lcp.simulation import (
+    Cells,
+    NoStopwatch,
+    Part,
+    Points,
+    Stopwatch,
+    Surface,
+    Volume,
+    VolumeGroup,
+)
 
 FRAME_FILE = re.compile(
     rf"(?P<name>[a-z][a-z_]*)_(?P<index>\d{{6,}})"
-    rf"\.(?P<format>p?vtu|p?vti|nvdb|{'|'.join(SUFFIXES.values())})"
+    rf"\.(?P<format>p?vtu|p?vti|n?vdb|{'|'.join(SUFFIXES.values())})"
 )
 COLLECTED = ("vtu", "vti", "pvtu", "pvti")  # formats that ParaView opens as a series
 WAITING = 2  # frames in memory, including the one being written
@@ -45,11 +55,12 @@ OWN_FORMATS: dict[str, tuple[Callable[..., None], Callable[..., int]]] = {
     "vtu": (write_vtu, vtu_bytes),
     "vti": (write_vti, vti_bytes),
     "nvdb": (write_nvdb, nvdb_bytes),
+    "vdb": (write_vdb, vdb_bytes),
 }
 
 
 class FrameFolder:
-    """Frames of one run: `frames/<name>_<index>.vtu` (or .vti, .nvdb).
+    """Frames of one run: `frames/<name>_<index>.vtu` (or .vti, .nvdb, .vdb).
 
     Except for volumes, `<name>.pvd` beside the folder lists them.
 
@@ -110,7 +121,7 @@ class FrameFolder:
 
         Collections list only files of VTK's XML formats.
         """
-        if isinstance(part, Volume):
+        if isinstance(part, Volume | VolumeGroup):
             return False
         return self.frame_format == "vtu" or (isinstance(part, Cells) and self.grid_format == "vti")
 
@@ -329,6 +340,8 @@ def part_format(part: Part, grid_format: GridFormat, frame_format: FrameFormat =
     """Return the format of a part's file; surfaces may also have a PLY file."""
     if isinstance(part, Volume):
         return "nvdb"
+    if isinstance(part, VolumeGroup):
+        return "vdb"
     if isinstance(part, Cells) and grid_format == "vti":
         return "vti"
     size = len(part.index if isinstance(part, Cells) else part.points)

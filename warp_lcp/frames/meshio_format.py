@@ -404,12 +404,12 @@ def _faults() -> tuple[type[Exception], ...]:
 
 
 def _active(volume: Volume) -> Cells:
-    """Return the voxels of a volume that are active in a NanoVDB file."""
-    active = (
-        np.abs(volume.values) < volume.band if volume.band is not None else volume.values != 0.0
-    )
+    """Return the voxels of a volume that are active in a NanoVDB or OpenVDB file."""
+    values, band = volume.values, volume.band
+    active = np.abs(values) < band if band is not None else values != 0.0
+    active = active.any(axis=3) if values.ndim == 4 else active
     index = np.argwhere(active)[:, ::-1] + np.array(volume.origin)
-    return Cells(volume.name, index, volume.spacing, 3, {volume.name: volume.values[active]})
+    return Cells(volume.name, index, volume.spacing, 3, {volume.name: values[active]})
 
 
 def _sample(kind: type, dimension: int, side: int) -> Points | Cells | Surface:

@@ -1,14 +1,15 @@
 """NanoVDB files of volumes: sparse voxels for renderers and Warp.
 
 NumPy writes them, so that no other thread is blocked. The layout is that of version 32 of the
-format, for trees of 5, 4 and 3 bits per axis (Warp's `native/nanovdb/NanoVDB.h` describes it): the
-header of the grid, that of the tree, a root with one entry, one upper node of 32^3 entries, lower
-nodes of 16^3 entries and leaves of 8^3 voxels. An entry is a value, or the offset of the child from
-its own node.
+format, for the trees of `warp_lcp.frames.voxel_tree` (Warp's `native/nanovdb/NanoVDB.h` describes
+it): the header of the grid, that of the tree, a root with one entry, one upper node of 32^3
+entries, lower nodes of 16^3 entries and leaves of 8^3 voxels. An entry is a value, or the offset of
+the child from its own node.
 
 Warp's own writer (1.19: `Volume.allocate_by_tiles`, `save_to_nvdb`) is as fast, but its files have
 no name, class, box and number of active voxels (all 0), and the deep inside of a level set reads as
-outside: readers that search for "level_set" find nothing.
+outside: readers that search for "level_set" find nothing. TinyVDB (0.9) saves NanoVDB files that
+it has read, but makes no new ones.
 """
 
 from __future__ import annotations
@@ -18,11 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from warp_lcp.files.atomic import replacing
+from warp_lcp.frames.voxel_tree import LEAF, LOWER, UPPER, VoxelTree
 from warp_lcp.frames.vtk_xml import raw
 from warp_lcp.simulation import Volume
 
-LEAF, LOWER, UPPER = 8, 16, 32  # entries along an edge of a node
-LARGEST = LEAF * LOWER * UPPER  # voxels along an edge of an upper node
 VERSION = 32 << 21 | 3 << 10 | 3
 LEVEL_SET, FOG_VOLUME = 1, 2  # classes of grids
 FLOAT = 1  # type of values
@@ -141,15 +141,6 @@ def write_nvdb(path: Path, volume: Volume) -> None:
         OSError: the file cannot be written.
         ValueError: the values are not on a 3-D grid, not finite, or more than 4096 along an axis.
     """
-    if (
-        volume.values.ndim != 3
-        or not np.isfinite(volume.values).all()
-        or max(volume.values.shape) > LARGEST
-    ):
-        raise ValueError(
-            f"the volume {volume.name!r} must hold finite values of a 3-D grid, at most {LARGEST} "
-            "along an axis"
-        )
     grid, header = _grid(volume)
     with replacing(path) as file:
         file.write(header)
@@ -181,13 +172,10 @@ def name_key(name: bytes) -> int:
 
 def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
     """Return the parts of a grid in a file, and the file's header."""
-    background = np.float32(0.0 if volume.band is None else volume.band)
-    tiles = _tiles(volume.values, background)
-    high, low = tiles.max(axis=(3, 4, 5)), tiles.min(axis=(3, 4, 5))
-    inside = np.zeros(high.shape, dtype=bool) if volume.band is None else high <= -background
-    used = high > 0.0 if volume.band is None else (low < background) & ~inside
-    leaves = _leaves(tiles, used, volume.band)
-    lower, upper = _nodes(used, inside, background)
+    voxels = VoxelTree.of(volume)
+    background = voxels.background
+    leaves = _leaves(voxels)
+    lower, upper = _nodes(voxels)
     root, tree, grid = np.zeros(1, dtype=ROOT), np.zeros(1, dtype=TREE), np.zeros(1, dtype=GRID)
     parts = [grid, tree, root, upper, lower, leaves]
     # Offset of the next part from the tree's beginning.
@@ -202,43 +190,18 @@ def _grid(volume: Volume) -> tuple[list[np.ndarray], bytes]:
     return parts, _header(grid, tree, root)
 
 
-def _tiles(values: np.ndarray, background: np.float32) -> np.ndarray:
-    """Return a view of the values by tile, shape (nx, ny, nz, 8, 8, 8).
-
-    With nx, ny and nz tiles.
-    """
-    nz, ny, nx = counts = [-(-count // LEAF) for count in values.shape]
-    padded = np.full([LEAF * count for count in counts], background, dtype=np.float32)
-    padded[tuple(slice(count) for count in values.shape)] = values
-    return padded.reshape(nz, LEAF, ny, LEAF, nx, LEAF).transpose(4, 2, 0, 5, 3, 1)
-
-
-def _leaves(tiles: np.ndarray, used: np.ndarray, band: float | None) -> np.ndarray:
+def _leaves(voxels: VoxelTree) -> np.ndarray:
     """Return the leaves, in the order of their positions."""
-    values = tiles[used].reshape(-1, LEAF**3)
-    leaves = np.zeros(len(values), dtype=LEAF_NODE)
-    if band is not None:
-        np.clip(values, -np.float32(band), np.float32(band), out=values)
-    active = values > 0.0 if band is None else np.abs(values) < np.float32(band)
-    leaves["low"], leaves["extent"], leaves["flags"] = LEAF * np.argwhere(used), LEAF - 1, HAS_BOX
-    leaves["values"], leaves["active"] = values, np.packbits(active, axis=1, bitorder="little")
+    leaves = np.zeros(len(voxels.values), dtype=LEAF_NODE)
+    leaves["low"], leaves["extent"], leaves["flags"] = voxels.low, LEAF - 1, HAS_BOX
+    leaves["values"] = voxels.values
+    leaves["active"] = np.packbits(voxels.active, axis=1, bitorder="little")
     return leaves
 
 
-def _nodes(
-    used: np.ndarray, inside: np.ndarray, background: np.float32
-) -> tuple[np.ndarray, np.ndarray]:
+def _nodes(voxels: VoxelTree) -> tuple[np.ndarray, np.ndarray]:
     """Return the lower nodes, in the order of their positions, and the upper one."""
-    counts = [-(-count // LOWER) for count in used.shape]
-    # 0: outside, -1: inside, else the number of a leaf, from 1.
-    kinds = np.zeros([LOWER * count for count in counts], dtype=np.int64)
-    kinds[tuple(slice(count) for count in used.shape)] = np.where(
-        used, np.cumsum(used).reshape(used.shape), -1 * inside
-    )
-    nx, ny, nz = counts
-    kinds = kinds.reshape(nx, LOWER, ny, LOWER, nz, LOWER).transpose(0, 2, 4, 1, 3, 5)
-    nonempty = kinds.any(axis=(3, 4, 5))
-    kinds = kinds[nonempty].reshape(-1, LOWER**3)
+    kinds, background = voxels.kinds, voxels.background
     lower, upper = np.zeros(len(kinds), dtype=LOWER_NODE), np.zeros(1, dtype=UPPER_NODE)
     lower["table"]["value"] = np.where(kinds < 0, -background, background)
     lower["children"] = np.packbits(kinds > 0, axis=1, bitorder="little")
@@ -246,8 +209,7 @@ def _nodes(
     begin = (len(lower) - node) * LOWER_NODE.itemsize  # offset of the leaves from the node
     lower["table"]["child"][node, entry] = begin + (kinds[node, entry] - 1) * LEAF_NODE.itemsize
     upper["table"]["value"] = background
-    x, y, z = np.argwhere(nonempty).T
-    place = (x * UPPER + y) * UPPER + z
+    place = voxels.lower_places
     upper["table"]["child"][0, place] = upper.nbytes + np.arange(len(lower)) * LOWER_NODE.itemsize
     children = np.zeros(UPPER**3, dtype=bool)
     children[place] = True

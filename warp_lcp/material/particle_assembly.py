@@ -345,7 +345,12 @@ def make_particle_volume(
     """Return the measurement of the material's volume, if the scene's output has it."""
     if not scene.output.volume:
         return None
-    return ParticleVolume(grid, boundary, particles_a_cell=scene.particles.per_axis**grid.dimension)
+    return ParticleVolume(
+        grid,
+        boundary,
+        particles_a_cell=scene.particles.per_axis**grid.dimension,
+        with_velocity=scene.output.volume_format == "vdb",
+    )
 
 
 def seed_materials(

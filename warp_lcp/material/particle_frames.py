@@ -16,7 +16,7 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.narrow_band import NarrowBand
 from warp_lcp.material.particle_volume import ParticleVolume
 from warp_lcp.rigid.bodies import RigidBodies
-from warp_lcp.simulation import Points, Surface, Volume
+from warp_lcp.simulation import Points, Surface, Volume, VolumeGroup
 
 
 class ParticleFrames(ABC):
@@ -85,24 +85,52 @@ class ParticleFrames(ABC):
             {"velocity": velocity.numpy().copy()},
         )
 
-    def volumes(self) -> list[Volume]:
+    def volumes(self) -> list[Volume | VolumeGroup]:
         """Return the material's level set and density for a frame; collective.
 
         Empty unless the scene asks for them. The root returns the volumes of all ranks, since no
-        reader merges several volumes.
+        reader merges several volumes. For OpenVDB they are one group, with the velocity.
         """
         if self.particle_volume is None:
             return []
-        part = self.grid.part
+        part, with_velocity = self.grid.part, self.particle_volume.with_velocity
         with self.particles.exchange.with_ghosts(UNSORTED):
             found = self.particle_volume.measure(self.particles, fill=self._fill_density())
+            level_set = found[0]
+            velocity = self._velocity_at_cells(level_set) if with_velocity else None
         whole = [part.gathered(volume.values) for volume in found]
+        moving = [] if velocity is None else [part.gathered(values) for values in velocity]
         first = part.gathered_from
-        return [
+        volumes = [
             replace(v, values=values, origin=first)
             for v, values in zip(found, whole, strict=True)
             if values is not None
         ]
+        if not with_velocity or not volumes:
+            return [*volumes]
+        vectors = np.stack([values for values in moving if values is not None], axis=-1)
+        velocities = Volume("velocity", vectors, level_set.spacing, origin=first)
+        return [VolumeGroup("volume", (*volumes, velocities))]
+
+    def _velocity_at_cells(self, level_set: Volume) -> np.ndarray:
+        """Return the velocity at the centers of cells [m/s], float32, shape (3, nz, ny, nx).
+
+        It is that of the faces, in cells within the material and the band of the level set; 0
+        elsewhere. Faces that do not yet have the particles' velocity get it in fields of their own,
+        so that the run does not change.
+        """
+        grid, fields = self.grid, self.velocity
+        if not self._faces_know:
+            fields = grid.faces()
+            particles = self.particles
+            faces_from_particles(grid, particles.position, particles.velocity, fields, grid.faces())
+        assert level_set.band is not None
+        cells = np.argwhere(level_set.values < level_set.band)
+        centers = (cells[:, ::-1] + np.array(grid.origin) + 0.5) * grid.spacing
+        points = wp.array(centers.astype(np.float32), dtype=wp.vec3, device=grid.device)
+        values = np.zeros((3, *level_set.values.shape), dtype=np.float32)
+        values[:, *cells.T] = sample(grid, fields, points).numpy().T
+        return values
 
     def _fill_density(self) -> Fill | None:
         """Return a function that adds the density of material without particles.

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from warp_lcp.grid.surface_mesh import MESH_LATTICE_BYTES, MESH_POINT_BYTES, MESH_SOLID_BYTES
 from warp_lcp.material.domain_window import start_of
-from warp_lcp.material.particle_volume import VOLUME_BYTES
+from warp_lcp.material.particle_volume import VELOCITY_BYTES, VOLUME_BYTES
 from warp_lcp.scene.models import SceneModel, model_lines, prices
 from warp_lcp.scene.presets import preset_values
 from warp_lcp.scene.scene import Scene
@@ -454,7 +454,9 @@ class ParticleScene(Scene):
             "reseeding": cells * RESEED_BYTES * (settings.reseed is not None),
             "narrow band": cells * BAND_BYTES * (settings.narrow_band is not None),
             "sources": cells * SOURCE_BYTES * bool(self.source),
-            "volume": cells * VOLUME_BYTES * self.output.volume,
+            "volume": cells
+            * (VOLUME_BYTES + VELOCITY_BYTES * (self.output.volume_format == "vdb"))
+            * self.output.volume,
             "surface mesh": self.output.surface * self._surface_bytes(),
             "particles": self.particle_estimate() * (VECTOR_BYTES * vectors + KEY_BYTES),
         }

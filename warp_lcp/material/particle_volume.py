@@ -11,6 +11,7 @@ from warp_lcp.material.boundary import Boundary
 from warp_lcp.simulation import Volume
 
 VOLUME_BYTES = 13  # fields of the level set, per cell
+VELOCITY_BYTES = 60  # points, velocities and faces while a frame is measured, per cell, at most
 
 
 class ParticleVolume:
@@ -20,10 +21,18 @@ class ParticleVolume:
         grid: a 3-D grid.
         boundary: solids and walls.
         particles_a_cell: number of particles in a cell of the material at rest.
+        with_velocity: whether frames also have the velocity, all volumes in one file.
     """
 
-    def __init__(self, grid: StaggeredGrid, boundary: Boundary, *, particles_a_cell: int) -> None:
-        self._grid, self._boundary = grid, boundary
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        boundary: Boundary,
+        *,
+        particles_a_cell: int,
+        with_velocity: bool = False,
+    ) -> None:
+        self._grid, self._boundary, self.with_velocity = grid, boundary, with_velocity
         self._level_set = LevelSet(grid, particles_a_cell=particles_a_cell)
 
     def measure(self, particles: Particles, *, fill: Fill | None = None) -> list[Volume]:

@@ -31,7 +31,7 @@ from warp_lcp.scene.scene import Scene
 from warp_lcp.scene.scene_file import SceneSource, load_scene, single_tables
 from warp_lcp.scene.table import KeyFault, SceneError
 from warp_lcp.settings import nearest
-from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed
+from warp_lcp.simulation import InputError, Part, Simulation, SimulationFailed, VolumeGroup
 
 if TYPE_CHECKING:
     import meshio
@@ -93,11 +93,15 @@ class Frame:
         """Return a `meshio.Mesh` for each part of the frame, by name.
 
         Points [m], cells, and the fields as point data or cell data. The parts are `particles`,
-        `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set` and
-        `density` if the scene has them. Of volumes only the cells within the level set's band, or
-        with a density other than 0, are included.
+        `grid` (its cells are quadrilaterals or hexahedra), and `surface`, `bodies`, `level_set`,
+        `density` and `velocity` if the scene has them. Of volumes only the cells within the level
+        set's band, or with a density or velocity other than 0, are included.
         """
-        return {part.name: to_meshio(part) for part in self.parts()}
+        found: dict[str, meshio.Mesh] = {}
+        for part in self.parts():
+            members = part.volumes if isinstance(part, VolumeGroup) else (part,)
+            found |= {member.name: to_meshio(member) for member in members}
+        return found
 
     def parts(self) -> list[Part]:
         """Return copies of the parts that a frame's files contain.

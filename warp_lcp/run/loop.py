@@ -42,8 +42,6 @@ from warp_lcp.simulation import (
     SimulationFailed,
     StepFailed,
     Stopwatch,
-    Surface,
-    Volume,
 )
 
 # Relative to the interval of frames: rounding of the time at the end of a frame.
@@ -547,9 +545,9 @@ class RunLoop:
             output.particles or output.grid or output.surface or output.volume or self._has_bodies
         ):
             return []
-        wanted = {Points: output.particles, Cells: output.grid, Surface: True, Volume: True}
+        wanted = {Points: output.particles, Cells: output.grid}
         with self.watch.stage("frames"):
-            return [part for part in self.simulation.frame() if wanted[type(part)]]
+            return [part for part in self.simulation.frame() if wanted.get(type(part), True)]
 
     def _write_frame(self, index: int, last: int, frame: list[Part]) -> None:
         if self.writer:

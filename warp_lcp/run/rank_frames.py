@@ -11,7 +11,7 @@ from warp_lcp.distributed.collective import Collective, on_root
 from warp_lcp.files.atomic import make_folder
 from warp_lcp.frames.frame_folder import FrameFolder, FrameWriter
 from warp_lcp.frames.pieces import WHOLE, Kind, VtkPiece, describe, rank_folder, write_whole
-from warp_lcp.simulation import Cells, Part, Stopwatch, Volume
+from warp_lcp.simulation import Cells, Part, Stopwatch, Volume, VolumeGroup
 
 Pieces = dict[str, VtkPiece]  # metadata of a rank's parts, by name
 
@@ -48,7 +48,9 @@ class RankFrames:
             OSError: a file cannot be written; the earlier ones are intact.
         """
         make_folder(self.pieces, within=self.whole.folder)
-        folders = [self.frames if isinstance(part, Volume) else self.pieces for part in frame]
+        folders = [
+            self.frames if isinstance(part, Volume | VolumeGroup) else self.pieces for part in frame
+        ]
         return [
             self.whole.write_part(folder / f"{part.name}_{index:06d}", part)
             for folder, part in zip(folders, frame, strict=True)
@@ -69,7 +71,7 @@ class RankFrames:
         return {
             part.name: describe(part, images if isinstance(part, Cells) else "vtu")
             for part in frame
-            if not isinstance(part, Volume)
+            if not isinstance(part, Volume | VolumeGroup)
         }
 
     @on_root

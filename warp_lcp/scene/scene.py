@@ -313,7 +313,10 @@ class Output(Table):
     surface_ply: bool = Field(default=False, description="surfaces also as PLY files")
     format: FrameFormat = Field(default="vtu", description="format of frames")
     grid_format: Literal["vtu", "vti"] = Field(default="vtu", description="format of cells")
-    volume: bool = Field(default=False, description="level set and density as NanoVDB files, 3-D")
+    volume: bool = Field(default=False, description="frames of level set and density, 3-D")
+    volume_format: Literal["nvdb", "vdb"] = Field(
+        default="nvdb", description='format of volumes: NanoVDB; "vdb": OpenVDB, with velocity'
+    )
     diagnostics: bool = Field(
         default=True, description="log volume and divergence; sand: yielding and dissipation"
     )
