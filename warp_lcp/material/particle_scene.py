@@ -440,7 +440,10 @@ class ParticleScene(Scene):
         cells, settings, cut = self.counted_cells, self.particles, self.cuts_cells
         moving = any(solid.moves for solid in self.solid)
         vectors = (
-            3 + (self.dimension if settings.transfer == "apic" else 0) + (self.kept(()) is not None)
+            3
+            + (self.dimension if settings.transfer == "apic" else 0)
+            + (self.kept(()) is not None)
+            + self.output.ids
         )
         correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {
