@@ -21,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from warp_lcp.files import Tables
 from warp_lcp.fluids import SIMULATOR, LiquidScene, LiquidSimulation
 from warp_lcp.grid.grid_part import ONE_PROCESS, SerialCommunicator
 from warp_lcp.run.stepping import stable_dt, take_step
@@ -172,7 +173,8 @@ def check(folder: Path, particles: int, steps: int, *, on_ranks: bool) -> None:
         file.unlink()
     collect(None)
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez(folder / f"piece_{rank}.npz", **as_piece(simulation))
+    arrays: Tables = dict(as_piece(simulation))
+    np.savez(folder / f"piece_{rank}.npz", **arrays)
     if is_root:
         table.save(folder / "table.npz")
 
