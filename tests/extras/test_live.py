@@ -122,6 +122,25 @@ def test_frames_reach_the_page_as_they_come(dots, tmp_path):
     assert abs(radius - 0.2).max() < 0.6 / 512 + 1e-5
 
 
+def test_of_many_particles_with_ids_the_same_are_shown(dots, tmp_path, monkeypatch):
+    """A thinned frame shows the same ids in each frame, in any order of the file."""
+    monkeypatch.setattr(live, "MOST_POINTS", 100)
+    rng = np.random.default_rng(5)
+    frames = []
+    for _ in range(2):
+        ids = rng.permutation(330)
+        places = np.stack([ids / 330, 0.5 + 0.0 * ids, 0.0 * ids], axis=-1)
+        part = dots_at(*places.tolist())
+        frames.append([Points(part.name, part.points, part.fields | {"id": ids})])
+    folder = write_run(tmp_path / "run", frames, SOLID)
+    with serving(folder) as server:
+        shown = [arrays(ask(server, f"/frame?number={n}")[1]) for n in range(2)]
+    for found in shown:
+        places = np.sort(found["points"].reshape(-1, 3)[:, 0])
+        np.testing.assert_allclose(places, np.arange(0, 330, 4) / 330, atol=1e-6)
+        assert len(found["values"]) == len(places)
+
+
 def test_surfaces_and_bodies_are_triangles(dots, tmp_path):
     surface, body = ball([0.5, 0.5, 0.5], 0.2), ball([0.2, 0.5, 0.5], 0.1, "bodies", 0)
     folder = write_run(tmp_path / "run", [[surface, body]], size=(1.0, 1.0, 1.0))

@@ -439,3 +439,49 @@ def test_frames_of_a_run_at_work_are_those_that_are_there(dots, tmp_path):
     FrameFolder(folder).write(2, 0.1, [ball([0.6, 0.5], 0.2)])
     assert exported(folder, tmp_path / "run.usdc").GetEndTimeCode() == 2.0
     assert export_format(tmp_path / "a.USDC").name == "USD"
+
+
+def test_ids_and_ages_are_written_in_the_order_of_ids(tmp_path):
+    """Ids in USD: sorted, so that a particle keeps its index while none comes or goes."""
+    liquid = [{"shape": "sphere", "center": [0.5, 0.65], "radius": RADIUS}]
+    jet = {"shape": "box", "min": [0.0, 0.8], "max": [0.125, 0.95]}
+    source = [jet | {"velocity": [1.0, 0.0], "start": 0.05}]
+    falling = scene(
+        size=[1.0, 1.0],
+        resolution=16,
+        liquid=liquid,
+        source=source,
+        time={"duration": 1.0, "frames_per_second": RATE, "dt_max": STEP},
+        output={"ids": True},
+    )
+    run_into(falling, tmp_path / "run", last_frame=LAST)
+    stage = exported(tmp_path / "run", tmp_path / "run.usdc")
+    before, counts = None, []
+    for number in range(LAST + 1):
+        frame = meshio.read(tmp_path / "run" / "frames" / f"particles_{number:06d}.vtu")
+        order = np.argsort(frame.point_data["id"])
+        ids = get(stage, "particles", "ids", number)
+        np.testing.assert_array_equal(ids, frame.point_data["id"][order])
+        points = get(stage, "particles", "points", number)
+        np.testing.assert_array_equal(points, frame.points[order])
+        velocity = get(stage, "particles", "velocities", number)
+        np.testing.assert_array_equal(velocity, frame.point_data["velocity"][order])
+        np.testing.assert_array_equal(
+            get(stage, "particles", "primvars:age", number), frame.point_data["age"][order]
+        )
+        if before is not None:  # of the fall, which begins first
+            count = len(before[0])
+            np.testing.assert_array_equal(ids[:count], before[0])
+            middle = 0.5 * (velocity[:count] + before[2])
+            way = points[:count] - before[1]
+            np.testing.assert_allclose(way, middle / RATE, atol=2.0 * GRAVITY * STEP / RATE)
+        before = ids, points, velocity
+        counts.append(len(ids))
+    assert prim(stage, "particles").GetAttribute("ids").GetTypeName() == "int64[]"
+    assert counts[0] < counts[-1]
+
+
+def test_frames_without_ids_have_no_attribute_for_them(falls, tmp_path):
+    stage = exported(falls[2], tmp_path / "fall.usdc", show=VisiblePart.PARTICLES)
+    assert not prim(stage, "particles").GetAttribute("ids").HasAuthoredValue()
+    assert not prim(stage, "particles").HasAttribute("primvars:age")

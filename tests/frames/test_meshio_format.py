@@ -96,6 +96,19 @@ def same(found: VtuMesh, expected: VtuMesh, *, bare: bool) -> None:
 
 
 @pytest.mark.parametrize("name", SUFFIXES)
+@pytest.mark.every_case
+def test_large_ids_are_exact_in_formats_that_hold_fields(tmp_path, name):
+    ids = RNG.permutation(2**40 + np.arange(7))
+    part = Points("particles", POINTS, fields(7) | {"id": ids})
+    held = holds(name, Points, 3)
+    if held.dress is None or held.dress is MeshConversion.BARE or name in WRITTEN_ONLY:
+        return
+    file = tmp_path / f"particles_000001.{SUFFIXES[name]}"
+    write_meshio(file, part, name)
+    np.testing.assert_array_equal(np.ravel(read_meshio(file, name).fields["id"]), ids)
+
+
+@pytest.mark.parametrize("name", SUFFIXES)
 @pytest.mark.parametrize("part", PARTS)
 def test_supported_data_round_trip_in_every_format(tmp_path, name, part):
     """Round trip of a part through each format.

@@ -77,6 +77,8 @@ def test_a_frame_has_the_simulation_s_own_arrays():
         shown = frame.parts()[0]
         assert np.array_equal(shown.points, frame.particles.position.numpy())
         assert frame.row.get("step", 0) == run.simulation.step_count
+        with pytest.raises(RunError, match=r"set output\.ids = true"):
+            assert frame.ids is None
     assert run.record.status == "finished"
 
 
@@ -337,8 +339,10 @@ def test_gravity_can_turn():
 
 
 def test_added_material_fills_what_is_empty_and_has_its_velocity():
-    run, counts = wl.Run(POOL, device="cpu", frames=4), []
+    run, counts = wl.Run(POOL | {"output": {"ids": True}}, device="cpu", frames=4), []
     for frame in run:
+        assert len(np.unique(frame.ids)) == len(frame.ids) == frame.particles.count
+        assert np.array_equal(frame.ages > frame.time - 1e-6, frame.ids < (counts or [2**62])[0])
         counts.append(frame.particles.count)
         if frame.index == 2:
             # Its lower half is full.

@@ -271,7 +271,7 @@ class ContactScene(Scene):
             errors.append(
                 CrossKeyError(("solid",), None, "has no rigid body: give one a density or a mass")
             )
-        for key in ("particles", "grid", "surface", "volume", "forces"):
+        for key in ("particles", "ids", "grid", "surface", "volume", "forces"):
             if getattr(self.output, key):
                 errors.append(CrossKeyError(("output", key), True, f"must be false: {NO_MATERIAL}"))
         if self.physics.density != type(self.physics).model_fields["density"].default:

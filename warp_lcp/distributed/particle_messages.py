@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 REACH = 1  # cells from a box within which particles touch its faces and cells
 ENDLESS = 1e30  # a coordinate beyond all others
-COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept")
+COLUMNS = ("position", "velocity", "affine_0", "affine_1", "affine_2", "kept", "identity")
 PLACE_WORDS, COLUMN_WORDS = 2, 3  # words of 4 bytes, of a particle in a message
 KERNELS = KernelFile(Path(__file__).parent / "headers/distributed.h")
 FIND_BORDER, PACK, UNPACK, SETTLE, GIVE_PLACES = (

@@ -9,6 +9,7 @@ import numpy as np
 
 import warp_lcp as wl
 from warp_lcp.distributed.decomposition import CellBox
+from warp_lcp.grid.particle_ids import ID
 from warp_lcp.material.particle_pieces import LATER, Piece, fields_of
 
 if TYPE_CHECKING:
@@ -29,7 +30,8 @@ def take_pieces(
 
     Args:
         part: the subdomain of this rank.
-        particles: names of the particles' arrays, float32 of shape (n, 3).
+        particles: names of the particles' arrays: `id`, int64 of shape (n,); the others float32 of
+            shape (n, 3).
         like: the other arrays of the part: its fields, `cells` among them, and numbers, which are
             the same in all pieces.
         signature: numbers that tell this scene's state from another's.
@@ -67,8 +69,11 @@ def take_pieces(
             name: np.zeros((*layers, *part.box.counts[::-1]), dtype=dtype)
             for name, (dtype, layers) in kinds.items()
         }
-        own_piece: Piece = {name: np.empty((0, 3), dtype=np.float32) for name in particles} | {
-            "place": np.empty(0, dtype=np.int64)
+        own_piece: Piece = {
+            name: np.empty(0, dtype=np.int64)
+            if name in (ID, "place")
+            else np.empty((0, 3), dtype=np.float32)
+            for name in (*particles, "place")
         }
         covered, parts = 0, [own_piece]
         for piece in pieces:

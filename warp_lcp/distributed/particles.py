@@ -28,7 +28,7 @@ from warp_lcp.distributed.particle_messages import (
 from warp_lcp.distributed.summation_order import SummationOrder
 from warp_lcp.grid.grid_part import ParticleExchange
 from warp_lcp.grid.particle_loops import launch
-from warp_lcp.grid.particles import NEW, Particles, ParticleTotals
+from warp_lcp.grid.particles import MOST_A_CELL, NEW, Particles, ParticleTotals
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
@@ -201,6 +201,10 @@ class ParticleMigration(ParticleExchange):
         self.drop_ghosts()
         self.particles.number()
         return max(NEW, 1 + int(self.part.ranks.max(self.place.max(initial=0))))
+
+    def last_cells(self, begin: int, behind: int = 0) -> np.ndarray:
+        """Return the cell of each particle from an index on, from its place."""
+        return (self.place[begin:] - behind) // MOST_A_CELL
 
     def count(self) -> None:
         """Count the particles of all ranks; collective."""

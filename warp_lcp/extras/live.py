@@ -48,7 +48,7 @@ MOST_CONNECTIONS = 16  # most connections; a new one then replaces the oldest
 # Most requests at a time, including those of closed connections; more are refused.
 MOST_ANSWERED = 64
 SHORTAGE = 0.2  # seconds
-MOST_POINTS = 300_000  # particles of a frame; of more, every second, third ... is sent
+MOST_POINTS = 300_000  # approximate limit of a frame's particles; of more, a part is sent
 # Lattice points along the longest side, of which those near a solid's surface are drawn.
 SOLID_POINTS = {2: 512, 3: 96}
 SAFE = (
@@ -133,7 +133,7 @@ class LiveRun:
                 raise RenderError(f"there is no frame {number}")
             frame = recording.frame(number)
             solids = self._solid_points(frame.time)
-        few = slice(None, None, len(frame.points) // MOST_POINTS + 1)
+        few = _few(len(frame.points), frame.ids)
         arrays: dict[str, np.ndarray] = {
             "points": frame.points[few],
             "values": frame.values[few],
@@ -321,6 +321,20 @@ class LiveServer(ThreadingHTTPServer):
 
     def handle_error(self, request: Request, client_address: ClientAddress) -> None:
         """Ignore errors of closed browsers."""
+
+
+def _few(count: int, ids: np.ndarray | None) -> slice | np.ndarray:
+    """Return which of a frame's particles are sent.
+
+    Without ids it is every second, third ... particle of the file. With ids it is those whose id is
+    a multiple of 1, 2, 4, ...: the same particles in each frame, and some of them where the step
+    doubles.
+
+    >>> [_few(MOST_POINTS + 1, ids) for ids in (None, np.array([3, 6, 8]))]
+    [slice(None, None, 2), array([False,  True,  True])]
+    """
+    step = count // MOST_POINTS + 1
+    return slice(None, None, step) if ids is None else ids % (1 << (step - 1).bit_length()) == 0
 
 
 def live_server(folder: Path, *, port: int, show: VisiblePart | None = None) -> LiveServer:

@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from warp_lcp.grid.motion import Motion
 from warp_lcp.render.actors import BODY_COLORS, SURFACES
 from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE
-from warp_lcp.render.recording import Recording
+from warp_lcp.render.recording import Recording, ids_of
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
 from warp_lcp.rigid.outline import body_surface
 from warp_lcp.scene.shapes import PlaneTable
-from warp_lcp.simulation import Surface
+from warp_lcp.simulation import Points, Surface
 
 if TYPE_CHECKING:
     from pxr import Gf, Usd, UsdGeom, Vt
@@ -103,7 +103,7 @@ class UsdStage:
             if self._dimension == 3:
                 self._surface.GetNormalsAttr().Set(_vectors(vertex_normals(surface)), code)
         if self._particles is not None:
-            particles = self._recording.particles(number)
+            particles = sorted_by_id(self._recording.particles(number))
             _set_points(
                 self._particles,
                 particles.points,
@@ -111,6 +111,8 @@ class UsdStage:
                 particles.fields.get("velocity"),
                 self._spacing,
             )
+            if self._recording.scene.output.ids:
+                self._set_ids(self._particles, particles, code)
         if (bodies := self._recording.bodies(number)) is not None:
             self._set_bodies(bodies, code)
         for motion, place in self._moving:
@@ -187,6 +189,18 @@ class UsdStage:
         points.CreateDisplayColorAttr(_color(color))
         return points
 
+    def _set_ids(self, prim: UsdGeom.Points, particles: Points, code: float) -> None:
+        """Set ids and ages [s] of particles; none in a frame that was written without."""
+        from pxr import Sdf, UsdGeom, Vt
+
+        ids = ids_of(particles)
+        ids = np.zeros(0, dtype=np.int64) if ids is None else ids
+        ages = particles.fields.get("age", np.zeros(0))
+        prim.GetIdsAttr().Set(Vt.Int64Array.FromNumpy(np.ascontiguousarray(ids)), code)
+        kind, place = Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex
+        age = UsdGeom.PrimvarsAPI(prim).CreatePrimvar("age", kind, place)
+        age.Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(ages, dtype=np.float32)), code)
+
     def _set_shape(
         self,
         shape: UsdGeom.Mesh | UsdGeom.BasisCurves,
@@ -204,6 +218,20 @@ class UsdStage:
             points, velocity = points[ends], None if velocity is None else velocity[ends]
             shape.GetCurveVertexCountsAttr().Set(counts, when)
         _set_points(shape, points, when, velocity, self._line_width)
+
+
+def sorted_by_id(particles: Points) -> Points:
+    """Return particles in the order of their ids; unchanged if they have none.
+
+    Programs that interpolate points between frames pair them by their index. In this order a
+    particle keeps its index while none comes or goes.
+    """
+    ids = ids_of(particles)
+    if ids is None:
+        return particles
+    order = np.argsort(ids, kind="stable")
+    fields = {name: values[order] for name, values in particles.fields.items()}
+    return Points(particles.name, particles.points[order], fields)
 
 
 def vertex_normals(surface: Surface) -> np.ndarray:

@@ -109,7 +109,7 @@ class MeshConversion(IntEnum):
     """Conversion of a mesh that a format needs, from none to most."""
 
     AS_IS = 0
-    PLAIN_NUMBERS = 1  # points in float64, integers in int32
+    PLAIN_NUMBERS = 1  # points and 64-bit integers in float64, other integers in int32
     SCALARS = 2  # also vectors as three fields, named by axis
     BARE = 3  # also without fields
 
@@ -336,10 +336,7 @@ def _dressed(mesh: VtuMesh, dress: MeshConversion) -> VtuMesh:
     if dress is MeshConversion.AS_IS:
         return mesh
     fields = {} if dress is MeshConversion.BARE else mesh.fields
-    fields = {
-        name: values.astype(np.int32) if values.dtype.kind in "biu" else values
-        for name, values in fields.items()
-    }
+    fields = {name: _plain(values) for name, values in fields.items()}
     if dress is MeshConversion.SCALARS:
         flat: dict[str, np.ndarray] = {}
         for name, values in fields.items():
@@ -352,6 +349,13 @@ def _dressed(mesh: VtuMesh, dress: MeshConversion) -> VtuMesh:
             )
         fields = flat
     return VtuMesh(mesh.points.astype(np.float64), mesh.corners, fields, mesh.on_cells)
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    """Return integers in int32; ids, which are 64-bit, in float64: exact below 2^53."""
+    if values.dtype.kind not in "biu":
+        return values
+    return values.astype(np.float64 if values.dtype.itemsize == 8 else np.int32)
 
 
 def _joined(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -115,6 +115,18 @@ class ParticleExchange:
         """Return a place in the order of sums after those of all particles; collective."""
         return 0
 
+    def last_cells(self, begin: int, behind: int = 0) -> np.ndarray | None:
+        """Return the cell of each particle from an index on, from its place.
+
+        The particles are sorted by cell, or have been added in the order of cells. Returns None on
+        a single process.
+
+        Args:
+            begin: index of the first one.
+            behind: place to which their places are relative, as of `next_place`.
+        """
+        return None
+
     def assign(self, arrays: Mapping[str, np.ndarray], place: np.ndarray) -> None:
         """Replace the particles by others, in the order of their places; collective.
 

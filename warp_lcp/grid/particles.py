@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_lcp.grid import particles_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list
+from warp_lcp.grid.particle_ids import NO_ID, pack_ids, unpack_ids
 from warp_lcp.grid.particle_loops import CPU_GRAIN, LIST_ROOM, ListMemory, launch
 from warp_lcp.grid.radix_sort import digits_of, sort_keys
 from warp_lcp.grid.staggered import StaggeredGrid
@@ -160,6 +161,7 @@ class Particles:
         velocity: [m/s], shape (n, 3).
         affine: also carry the gradient of each velocity component [1/s].
         kept: a number that each particle carries, shape (n,); None if they carry none.
+        ids: whether each particle has an id.
         indexed: sort in every step and store the first particle of each cell, for transfers that
             gather. Default on CUDA, if the transfers need it there.
 
@@ -189,6 +191,7 @@ class Particles:
         *,
         affine: bool,
         kept: np.ndarray | None = None,
+        ids: bool = False,
         indexed: bool | None = None,
     ) -> None:
         _check_shapes(position, velocity)
@@ -202,7 +205,7 @@ class Particles:
             "velocity",
             *(f"affine_{c}" for c in range(grid.dimension if affine else 0)),
         ]
-        self._names += ["kept"] * (kept is not None)
+        self._names += ["kept"] * (kept is not None) + ["identity"] * ids
         self._tally, columns, device = None, len(kernels.TOTAL.reductions), grid.device
         launches = self._launch_totals, self._launch_numbers, self._launch_sort
         self._totals, self._numbering, self._sorting = (
@@ -272,8 +275,22 @@ class Particles:
         """
         return self._columns["kept"].view if "kept" in self._columns else None
 
+    @property
+    def ids(self) -> np.ndarray | None:
+        """Copy of the particles' ids, int64, shape (count,); None if they have none."""
+        column = self._columns.get("identity")
+        return None if column is None else unpack_ids(column.view.numpy())
+
+    def set_ids(self, first: int, ids: np.ndarray) -> None:
+        """Set the ids of the particles from an index on; particles must have ids."""
+        self._columns["identity"].set_from(first, pack_ids(ids))
+
     def append(
-        self, position: np.ndarray, velocity: np.ndarray, kept: np.ndarray | float | None = None
+        self,
+        position: np.ndarray,
+        velocity: np.ndarray,
+        kept: np.ndarray | float | None = None,
+        ids: np.ndarray | None = None,
     ) -> None:
         """Add particles at the end, with zero gradient.
 
@@ -284,6 +301,7 @@ class Particles:
             velocity: [m/s], shape (n, 3).
             kept: the number that each carries, or one for all. Default: 1, for particles that carry
                 one.
+            ids: their ids, int64, shape (n,). Default: `NO_ID`, for particles that have ids.
 
         Raises:
             ValueError: the shapes do not match.
@@ -300,6 +318,8 @@ class Particles:
                     len(position),
                 )
                 column.set_from(before, np.repeat(numbers[:, None], 3, axis=1))
+            elif name == "identity":
+                self.set_ids(before, np.full(len(position), NO_ID) if ids is None else ids)
             else:  # sorting may have left anything behind the particles in use
                 column.set_from(before, {"position": position, "velocity": velocity}.get(name, 0.0))
         self.exchange.register_append(len(position))
@@ -359,7 +379,8 @@ class Particles:
                 kernels.stays_kernel, self.count, [marks, stay, self._removed.array], device=device
             )
             return
-        columns = dict.fromkeys(("affine_0", "affine_1", "affine_2", "kept")) | self.arrays()
+        optional = ("affine_0", "affine_1", "affine_2", "kept", "identity")
+        columns = dict.fromkeys(optional) | self.arrays()
         kernel_args: dict[str, object] = {
             "removed": self._removed.array,
             "marks": marks,

@@ -86,7 +86,8 @@ class NarrowBand:
             there was.
         interior: sums over the cells without particles, at their centers; its count is theirs.
         full: depth from which on cells count as full [cells].
-        fresh: particles that the last exchange has put into the band.
+        fresh: particles that the last exchange has put into the band; they are the last ones.
+        behind: place to which the places of these are relative, on ranks.
 
     Raises:
         ValueError: the width is too small.
@@ -125,7 +126,7 @@ class NarrowBand:
         self._sums = wp.zeros(
             (*grid.shape[:2], kernels.COLUMNS), dtype=wp.float64, device=grid.device
         )
-        self.held = self.fresh = 0
+        self.held = self.fresh = self.behind = 0
         self._numbered = kernels.CellNumbering()
         self._numbered.origin, self._numbered.across = (
             wp.vec3i(*grid.origin),
@@ -274,7 +275,7 @@ class NarrowBand:
             step: number of the step, which the random part of new places depends on.
             saved: velocity as it came from the particles [m/s], for FLIP.
         """
-        first = particles.exchange.next_place()
+        self.behind = first = particles.exchange.next_place()
         self._move_to(window)
         self._each.value = self.particles_a_cell * self.density
         self._depths.run(kind, phi, contact, variant=phi is None)

@@ -306,6 +306,7 @@ def make_spray(
         placed,
         side_bits(scene.domain.open),
         keeps=scene.carried_numbers(()) is not None,
+        ids=scene.output.ids,
     )
 
 
@@ -431,7 +432,11 @@ def make_particles(
     affine, kept = scene.particles.transfer == "apic", kept_by(scene, owner)
     # Transfers near barriers, and of what particles carry, gather the particles of cells.
     indexed = True if grid.barriers is not None or kept is not None else None
-    return Particles(grid, position, velocity, affine=affine, kept=kept, indexed=indexed), notes
+    ids = scene.output.ids
+    particles = Particles(
+        grid, position, velocity, affine=affine, kept=kept, ids=ids, indexed=indexed
+    )
+    return particles, notes
 
 
 def kept_by(scene: ParticleScene, owner: np.ndarray) -> np.ndarray | None:

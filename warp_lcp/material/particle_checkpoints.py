@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_lcp.grid.grid_part import subdomain_of
+from warp_lcp.grid.particle_ids import ID, NO_ID, ParticleIds, cell_numbers, pack_ids, unpack_ids
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.domain_window import DomainWindow, carry_over
 from warp_lcp.material.narrow_band import without_band
 from warp_lcp.material.particle_frames import ParticleFrames
-from warp_lcp.material.particle_pieces import Piece, piece_of, state_of
+from warp_lcp.material.particle_pieces import IDENTITY, Piece, piece_of, state_of
 from warp_lcp.material.particle_redistribution import ParticleRedistribution
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import check_state, other_spacing, signature
@@ -98,8 +99,48 @@ class ParticleCheckpoints(ParticleFrames):
             for name, array in self.particles.arrays().items()
         }
 
+    def _stored_arrays(self) -> dict[str, np.ndarray]:
+        """Return `_particle_arrays` as a state has them: ids are numbers."""
+        arrays = self._particle_arrays()
+        if self.births is not None:
+            arrays[ID] = unpack_ids(arrays.pop("identity"))
+        return arrays
+
+    def _with_identity(self, arrays: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
+        """Return particles of a state with the column of their ids, `NO_ID` if it has none."""
+        if self.births is None:
+            return arrays
+        ids = arrays[ID] if ID in arrays else np.full(len(arrays["position"]), NO_ID)
+        return {**arrays, "identity": pack_ids(ids)}
+
+    def _give_ids(self, count: int, time: float) -> None:
+        """Give new ids to the last particles, in the order of their cells; collective.
+
+        Args:
+            count: number of these particles on this process.
+            time: time of their birth [s].
+        """
+        if self.births is None:
+            return
+        particles, begin = self.particles, self.particles.count - count
+        points = particles.position[begin:].numpy() if count else np.zeros((0, 3))
+        cells = cell_numbers(self.grid, points)
+        self.births.give(particles, begin, self.grid.part, time, cells)
+
+    def _renew_ids(self, births: ParticleIds) -> None:
+        """Give new ids to all particles at the current time, after those of `births`; collective.
+
+        They are those of a state without ids, or of another grid.
+        """
+        if self.births is not None:
+            self.births = births
+            self._give_ids(self.particles.count, self.time)
+            if self.spray.particles.count:
+                births.give(self.spray.particles, 0, self.grid.part, self.time)
+
     def _assign(self, arrays: Mapping[str, np.ndarray], flying: int = 0) -> None:
         """Replace the particles; the last `flying` of them are spray."""
+        arrays = self._with_identity(arrays)
         on_grid = len(arrays["position"]) - (flying if self.spray.active else 0)
         self.particles.assign({name: arrays[name][:on_grid] for name in self.particles.arrays()})
         self.spray.particles.assign(
@@ -119,11 +160,12 @@ class ParticleCheckpoints(ParticleFrames):
         int64 (n,), their order; of the box, shape (..., nz, ny, nx): `cells` int8, the other fields
         of `own_state` and those of a narrow band, and once particles were moved apart
         `density_correction` float64; the numbers of `own_state`, of a band and of bodies, the same
-        on all ranks.
+        on all ranks. With `output.ids` particles have `id` int64 (n,), and all ranks the table of
+        `ParticleIds.state`.
         """
         part, flying = self.grid.part, self.spray.particles.count
         counts = {"spray": flying, "added": self.added}
-        particles = self._particle_arrays() | {
+        particles = self._stored_arrays() | {
             name: np.array(count) for name, count in counts.items() if count
         }
         particles |= self.particles.exchange.state()
@@ -134,14 +176,9 @@ class ParticleCheckpoints(ParticleFrames):
         }
         bodies = self.bodies.state() if self.bodies is not None else {}
         known = {"signature": signature(self.scene, self.grid)}
-        return (
-            clock
-            | known
-            | particles
-            | part.checkpoint_fields(self._fields())
-            | bodies
-            | part.where()
-        )
+        births = self.births.state() if self.births is not None else {}
+        fields = part.checkpoint_fields(self._fields())
+        return clock | known | particles | births | fields | bodies | part.where()
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Continue from `state`, on ranks that of one process; collective.
@@ -160,13 +197,30 @@ class ParticleCheckpoints(ParticleFrames):
         varies = bool(self.sources or self.outlets or self.band or self.added)
         check_state(
             state,
-            expected,
+            {name: array for name, array in expected.items() if name not in IDENTITY},
             changing=[*self.particles.arrays()] if varies else [],
             solids_move=self.boundary.moves,
         )
+        has_ids = self._has_ids(state)
         self._assign(state, int(state.get("spray", 0)))
         self._take_fields(state)
         self._take_clock(state)
+        if not has_ids:
+            self._renew_ids(ParticleIds())
+
+    def _has_ids(self, state: Mapping[str, np.ndarray]) -> bool:
+        """Return whether a state has ids; take over its table of births.
+
+        Raises:
+            ValueError: they are damaged.
+        """
+        if self.births is None or ID not in state:
+            return False
+        ids, count = np.asarray(state[ID]), len(state["position"])
+        if (ids.shape, ids.dtype) != ((count,), np.dtype(np.int64)):
+            raise ValueError(f"the state's {ID} is {ids.dtype}{ids.shape}: must be int64({count},)")
+        self.births.restore(state, [ids])
+        return True
 
     def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
         """Set time, bodies and places of solids to those of a state."""
@@ -210,7 +264,11 @@ class ParticleCheckpoints(ParticleFrames):
         """Continue in other boxes of the same ranks; collective."""
         before, piece, expected = subdomain_of(self.grid), self.state(), self._global_count()
         self._work_on(part)
-        self._take_pieces([part.migrate(piece, list(self.particles.arrays()), before)], expected)
+        self._take_pieces([part.migrate(piece, self._stored_names(), before)], expected)
+
+    def _stored_names(self) -> list[str]:
+        """Return the names of the particles' arrays in a state."""
+        return [ID if name == "identity" else name for name in self.particles.arrays()]
 
     def _global_count(self) -> int:
         """Return the number of particles on all ranks, narrow band interior included."""
@@ -235,20 +293,27 @@ class ParticleCheckpoints(ParticleFrames):
         """
         part = subdomain_of(self.grid)
         names, bodies = (
-            list(self.particles.arrays()),
+            self._stored_names(),
             self.bodies.state() if self.bodies is not None else {},
         )
         band = self.band.state() if self.band is not None else {}
         own_state = self.own_state() | band
+        births = self.births.state() if self.births is not None else {}
+        has_ids = ID in names and all(ID in piece for piece in pieces)
+        if ID in names and not has_ids:
+            names.remove(ID)
+            births = {}
         solids = None if self.boundary.moves else own_state["cells"]
         particles, cells, numbers = part.take_pieces(
-            pieces, names, own_state | bodies, signature(self.scene, self.grid), solids
+            pieces, names, own_state | bodies | births, signature(self.scene, self.grid), solids
         )
+        if self.births is not None and has_ids:
+            self.births.restore(numbers)
         interior = int(numbers["interior"][0]) if self.band is not None else 0
         everyone = int(part.ranks.sum(len(particles["place"]))) + interior
         if everyone != expected and not (self.sources or self.outlets):
             raise ValueError(f"the pieces have {everyone} particles: this scene has {expected}")
-        self.particles.exchange.assign(particles, particles["place"])
+        self.particles.exchange.assign(self._with_identity(particles), particles["place"])
         self._faces_know = False
         self.rearrangement.expect(cells)
         state = own_state | self.rearrangement.state()
@@ -258,6 +323,8 @@ class ParticleCheckpoints(ParticleFrames):
             state | {name: numbers[name] for name in own_state.keys() & numbers.keys()}
         )
         self._take_clock(numbers)
+        if not has_ids:
+            self._renew_ids(ParticleIds())
 
     def _on_this_grid(self, state: Mapping[str, np.ndarray]) -> Mapping[str, np.ndarray]:
         """Use the grid of a state if the scene allows that, else convert the state.
@@ -281,7 +348,8 @@ class ParticleCheckpoints(ParticleFrames):
     def resample(self, state: Mapping[str, np.ndarray]) -> list[str]:
         """Continue from the state of the same scene on another grid.
 
-        The particles are resampled, and the next solve starts without a guess.
+        The particles are resampled, and the next solve starts without a guess. Resampled particles
+        are new ones: they get ids that have not been used, and their age is 0.
 
         Raises:
             ValueError: the state differs in more than the grid, or no particle is left.
@@ -290,7 +358,10 @@ class ParticleCheckpoints(ParticleFrames):
         if self.bodies is not None and "bodies" not in state:
             raise ValueError("the state has no bodies: it does not belong to this scene")
         self._take_clock(state)
-        settings, wanted = self.scene.particles, self.particles.arrays().keys()
+        settings, wanted = self.scene.particles, self.particles.arrays().keys() - {"identity"}
+        births = ParticleIds()
+        if self._has_ids(state) and self.births is not None:
+            births = self.births
         state = without_band(state, spacing, settings.seed)
         arrays, moved = resampled(
             {name: np.asarray(state[name]) for name in wanted},
@@ -304,6 +375,7 @@ class ParticleCheckpoints(ParticleFrames):
         if self.band is not None:
             self.band.forget()
         self.particles.sort()
+        self._renew_ids(births)
         self.mark()
         return resampling_notes(
             len(state["position"]), self.particles.count, moved, spacing, self.grid
@@ -316,6 +388,7 @@ class ParticleCheckpoints(ParticleFrames):
         material may be.
         """
         self.particles.append(position, velocity)
+        self._give_ids(len(position), self.time)
         self.added += len(position)
         self._faces_know = False
         self.particles.sort()

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.level_set import Fill
+from warp_lcp.grid.particle_ids import ParticleIds, unpack_ids
 from warp_lcp.grid.particles import UNSORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.surface_mesh import FilledInterior, SurfaceMesh, faces_from_particles, sample
@@ -31,6 +32,8 @@ class ParticleFrames(ABC):
     particle_volume: ParticleVolume | None
     velocity: list[wp.array]
     weights: list[wp.array]
+    births: ParticleIds | None
+    time: float
     _faces_know: bool
 
     @abstractmethod
@@ -46,13 +49,28 @@ class ParticleFrames(ABC):
         return self.grid.domain_counts if self.grid.part.shared or self.grid.whole is None else None
 
     def points(self) -> Points:
-        """Return the particles for a frame, with velocity and speed [m/s]."""
-        position, velocity = (self._particle_arrays()[name] for name in ("position", "velocity"))
-        return Points(
-            "particles",
-            position,
-            {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))},
-        )
+        """Return the particles for a frame, with velocity and speed [m/s].
+
+        If they have ids, with `id` and `age` [s].
+        """
+        arrays = self._particle_arrays()
+        velocity = arrays["velocity"]
+        fields = {"velocity": velocity, "speed": np.sqrt(np.einsum("ij,ij->i", velocity, velocity))}
+        if self.births is not None:
+            ids = unpack_ids(arrays["identity"])
+            fields |= {"id": ids, "age": self.births.ages(ids, self.time)}
+        return Points("particles", arrays["position"], fields)
+
+    @property
+    def ids(self) -> np.ndarray | None:
+        """Ids of `particles`, int64, shape (count,); None without `output.ids`."""
+        return self.particles.ids
+
+    @property
+    def ages(self) -> np.ndarray | None:
+        """Ages of `particles` [s], float32, shape (count,); None without `output.ids`."""
+        ids = self.particles.ids
+        return None if ids is None or self.births is None else self.births.ages(ids, self.time)
 
     def surfaces(self) -> list[Surface]:
         """Return the material's surface for a frame, if the scene asks for it; collective.

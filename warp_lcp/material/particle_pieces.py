@@ -6,12 +6,14 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from warp_lcp.grid.particle_ids import BIRTH_TIMES, FIRST_IDS, ID
 from warp_lcp.material.particle_redistribution import STATE
 
 # One rank's piece of a simulation's state. The last axes of fields of cells are z, y, x.
 Piece = Mapping[str, np.ndarray]
 
 ALIKE = ("bodies", "body_contacts")  # tables that are the same on all ranks
+IDENTITY = (ID, FIRST_IDS, BIRTH_TIMES)  # arrays that a state has with `output.ids`
 LATER = {STATE: np.float64}  # arrays that exist after the first density correction
 
 
@@ -60,7 +62,7 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
             name
             for piece in pieces
             for name in (*like, "place", "box")
-            if name not in (*piece, *LATER)
+            if name not in (*piece, *LATER, *IDENTITY)
         }
     )
     if missing or not pieces:
@@ -74,12 +76,13 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
         for name, dtype in LATER.items()
         if all(name in piece for piece in pieces)
     }
-    like = {name: values for name, values in like.items() if name not in LATER} | later
+    absent = {name for name in IDENTITY if any(name not in piece for piece in pieces)}
+    like = {name: v for name, v in like.items() if name not in {*LATER, *absent}} | later
     state, covered, fields = {}, 0, fields_of(like)
     for name, values in like.items():
         if name in fields:
             state[name] = np.array(values)
-        elif values.ndim == 2 and name not in ALIKE:
+        elif name == ID or (values.ndim == 2 and name not in ALIKE):
             state[name] = np.concatenate([piece[name] for piece in pieces])[order]
         else:
             state[name] = np.asarray(pieces[0][name])

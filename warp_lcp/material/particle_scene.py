@@ -443,6 +443,7 @@ class ParticleScene(Scene):
             3
             + (self.dimension if settings.transfer == "apic" else 0)
             + (self.carried_numbers(()) is not None)
+            + self.output.ids
         )
         correction = CORRECTION_BYTES + CUT_CORRECTION_BYTES * cut + EVEN_BYTES * self.keeps_volume
         parts = {

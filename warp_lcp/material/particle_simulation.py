@@ -13,6 +13,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.grid.active_rows import ActiveRows
+from warp_lcp.grid.particle_ids import ParticleIds
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.particles import Particles, ParticleTotals
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
@@ -99,6 +100,7 @@ class ParticleSimulation(ParticleCheckpoints):
 
     Attributes:
         particles: the material, without its spray.
+        births: ids that have been given and their times; None if particles have no ids.
         velocity: velocity of the last step on the faces, one field a component [m/s].
         weights: weights of the particles on each component's faces, in the last step.
         flights: conserves the momenta of airborne bodies; None if it is off.
@@ -149,6 +151,7 @@ class ParticleSimulation(ParticleCheckpoints):
         self.particle_mass = (
             scene.physics.density * grid.cell_volume / scene.particles.per_axis**grid.dimension
         )
+        self.births = ParticleIds() if particles.ids is not None else None
         self.layers = self.reach = math.ceil(scene.time.cfl) + 2
         self._coverage, self.spray = coverage, spray or Spray(grid, (), 0, active=False)
         others = set(vars(self))
@@ -159,6 +162,9 @@ class ParticleSimulation(ParticleCheckpoints):
             self.sources.emit(particles, None, self.time)
         particles.sort()
         particles.exchange.count()
+        if self.births is not None:
+            cells = particles.exchange.last_cells(0)
+            self.births.give(particles, 0, grid.part, self.time, cells)
 
     def allocate(self, grid: StaggeredGrid, parts: GridComponents) -> None:
         """Allocate the parts that belong to a grid; subclasses add theirs."""
@@ -531,6 +537,10 @@ class ParticleSimulation(ParticleCheckpoints):
                 self.band.exchange(
                     self.particles, window, kind, phi, contact, self.step_count, self._saved or ()
                 )
+                if self.births is not None:
+                    begin = self.particles.count - self.band.fresh
+                    cells = self.particles.exchange.last_cells(begin, self.band.behind)
+                    self.births.give(self.particles, begin, self.grid.part, self.time, cells)
 
     def grid_to_particles(self, window: Window, kind: wp.array, dt: float) -> None:
         """Find airborne bodies; transfer the faces' velocity to the particles (G2P).
@@ -786,9 +796,12 @@ class ParticleSimulation(ParticleCheckpoints):
                     swallowed, gone = outlets.apply(particles, *span)
                     drained, departed = drained + swallowed, departed + gone
             emitted = self.sources.emit(self.particles, *span) if self.sources is not None else 0
+        new = emitted
         emitted, drained, departed = self.grid.part.ranks.sum(
             np.array([emitted, drained, departed])
         ).tolist()
+        if emitted:
+            self._give_ids(new, self.time + dt)
         return {"emitted": emitted, "drained": drained, "departed": departed}
 
     def _totals_row(self, totals: ParticleTotals, dt: float) -> Row:

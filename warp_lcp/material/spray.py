@@ -60,6 +60,7 @@ class Spray:
         open_sides: open sides of the domain, see `warp_lcp.grid.domain_sides.side_bits`.
         active: whether any particle may fly.
         keeps: whether particles carry a number.
+        ids: whether particles have ids.
 
     Attributes:
         particles: those in flight.
@@ -73,6 +74,7 @@ class Spray:
         *,
         active: bool = True,
         keeps: bool = False,
+        ids: bool = False,
     ) -> None:
         self.active, self._solids, self._open, self._extent, self._dimension = (
             active,
@@ -90,6 +92,7 @@ class Spray:
             nothing,
             affine=False,
             kept=nothing[:, 0] if keeps else None,
+            ids=ids,
             indexed=False,
         )
 
@@ -228,6 +231,7 @@ class Spray:
         if not which.any():
             return
         kept = None if source.kept is None else source.kept.numpy()[which, 0]
-        target.append(source.position.numpy()[which], source.velocity.numpy()[which], kept)
+        ids = None if source.ids is None else source.ids[which]
+        target.append(source.position.numpy()[which], source.velocity.numpy()[which], kept, ids)
         source.marks.assign(which.astype(np.int32))
         source.remove(source.marks)

@@ -50,6 +50,7 @@ class RecordedFrame:
         surface: surface of the material; None if not shown.
         bodies: current surfaces of rigid bodies, with the field `body`; None if the scene has none.
         cells: cells with their fields; None if not shown.
+        ids: ids of the particles, int64, shape (n,); None if the frame has none.
     """
 
     time: float
@@ -58,6 +59,7 @@ class RecordedFrame:
     surface: Surface | None = None
     bodies: Surface | None = None
     cells: Cells | None = None
+    ids: np.ndarray | None = None
 
 
 ContentT = TypeVar("ContentT", VtuMesh, Cells)
@@ -201,17 +203,23 @@ class Recording:
         Raises:
             RenderError: a file cannot be read, or lacks a field.
         """
-        points, values = (
-            (np.zeros((0, 3)), np.zeros(0))
+        points, values, ids = (
+            (np.zeros((0, 3)), np.zeros(0), None)
             if self.show not in WITH_PARTICLES
-            else self.read(number)
+            else self._read(number)
         )
         surface = self.surface(number) if self.show in WITH_SURFACE else None
         filled = (
             self._cells(number) if self.cells and self._file("grid", number).is_file() else None
         )
         return RecordedFrame(
-            self.scene.time.frame_time(number), points, values, surface, self.bodies(number), filled
+            self.scene.time.frame_time(number),
+            points,
+            values,
+            surface,
+            self.bodies(number),
+            filled,
+            ids,
         )
 
     def surface(self, number: int) -> Surface:
@@ -244,7 +252,6 @@ class Recording:
         """
         return self._surface("bodies", number) if self._file("bodies", number).is_file() else None
 
-    @np.errstate(invalid="ignore")  # values that are no numbers are omitted
     def read(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Return positions [m], shape (n, 3), and color values, shape (n,), of a frame.
 
@@ -253,6 +260,12 @@ class Recording:
         Raises:
             RenderError: a file cannot be read, or lacks the field that colors the particles.
         """
+        points, values, _ = self._read(number)
+        return points, values
+
+    @np.errstate(invalid="ignore")  # values that are no numbers are omitted
+    def _read(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return positions and color values as of `read`, and ids if the frame has them."""
         particles = self.particles(number)
         points = np.asarray(particles.points, dtype=np.float64)
         if self.color is Color.PRESSURE:
@@ -263,8 +276,8 @@ class Recording:
             values = np.linalg.norm(self._field(particles.fields, "velocity", 3), axis=1)
         else:
             values = np.zeros(len(points))
-        finite = np.isfinite(values)
-        return points[finite], values[finite]
+        finite, ids = np.isfinite(values), ids_of(particles)
+        return points[finite], values[finite], None if ids is None else ids[finite]
 
     @cached_property
     def scale(self) -> ColorScale:
@@ -438,6 +451,12 @@ class Recording:
             int
         )
         return cast(np.ndarray, table[tuple(cell.T)])
+
+
+def ids_of(particles: Points) -> np.ndarray | None:
+    """Return the ids of a frame's particles, int64, shape (n,); None if it has none."""
+    ids = particles.fields.get("id")
+    return None if ids is None else np.asarray(ids).ravel().astype(np.int64)
 
 
 def spread(numbers: Sequence[int], count: int) -> list[int]:

@@ -71,6 +71,30 @@ class Frame:
         return _of_particles(self.simulation).particles
 
     @property
+    def ids(self) -> np.ndarray:
+        """Ids of `particles`, int64, shape (count,).
+
+        Raises:
+            RunError: the scene's `output.ids` is false.
+        """
+        return self._identified(_of_particles(self.simulation).ids)
+
+    @property
+    def ages(self) -> np.ndarray:
+        """Ages of `particles` [s], float32, shape (count,).
+
+        Raises:
+            RunError: the scene's `output.ids` is false.
+        """
+        return self._identified(_of_particles(self.simulation).ages)
+
+    @staticmethod
+    def _identified(values: np.ndarray | None) -> np.ndarray:
+        if values is None:
+            raise RunError("particles have no ids: set output.ids = true")
+        return values
+
+    @property
     def bodies(self) -> Sequence[RigidBody]:
         """Rigid bodies in the order of their solids.
 

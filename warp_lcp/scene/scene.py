@@ -299,6 +299,7 @@ class Output(Table):
     """[output]: files in the run folder."""
 
     particles: bool = Field(default=True, description="frames of particles")
+    ids: bool = Field(default=False, description="id and age of each particle")
     grid: bool = Field(default=True, description="frames of cells")
     surface: bool = Field(default=False, description="frames of the surface")
     surface_resolution: int | None = Field(

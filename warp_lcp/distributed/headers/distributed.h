@@ -25,7 +25,8 @@ auto side_of_box = [&](const T* at) -> int {
 #include "copy_bytes"
 float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data,
                           (float*)given.affine_0.data, (float*)given.affine_1.data,
-                          (float*)given.affine_2.data, (float*)given.kept.data};
+                          (float*)given.affine_2.data, (float*)given.kept.data,
+                          (float*)given.identity.data};
 auto to_words = [&](int* to, long long p) {  // message: place, then the columns
     COPY_BYTES(to, place + p, 8);
     to += 2;
@@ -112,8 +113,8 @@ found[0] = many;
 // After a positive offset they are at least `end_`, so that rounding does not put them inside the
 // box.
 //   compute    float32
-//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
-//              boxes, border, cells, message; float64 offsets
+//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?, identity?;
+//              int64 place; int32 boxes, border, cells, message; float64 offsets
 //   box        int32 found
 //   numbers    int ends; bool around; float32 end_x, end_y, end_z
 #include "columns"
@@ -157,8 +158,8 @@ for (int p = 0; p < count; ++p) {
 
 // kernel warp_lcp.distributed.particles.unpack: Append the particles of messages
 //   compute    float32
-//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
-//              message
+//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?, identity?;
+//              int64 place; int32 message
 //   box        int32 found
 //   numbers    int count, come
 #include "columns"
@@ -169,8 +170,8 @@ for (int p = 0; p < come; ++p) from_words(message + (long long)words * p, count 
 // and of ghosts. `found`: the number of own particles, the number with ghosts, and the number of
 // own slots that are filled again, which are the first of `others`.
 //   compute    float32
-//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?; int64 place; int32
-//              boxes, border, cells, message, others, ghosts, flags
+//   whole      vec3 position, velocity?, affine_0?, affine_1?, affine_2?, kept?, identity?;
+//              int64 place; int32 boxes, border, cells, message, others, ghosts, flags
 //   box        int32 found
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 low_x,
 //              low_y, low_z, high_x, high_y, high_z, reach; int count, come

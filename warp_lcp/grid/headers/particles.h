@@ -335,12 +335,14 @@ for (int column = P.first; column < P.first + n; ++column) {
 // kernel warp_lcp.grid.particles.close_ranks: Remove the marked particles in place; the others keep
 // their order. Counts: particles with mark 1, and those with another mark
 //   compute    float32
-//   whole      int32 marks; vec3 position, velocity, affine_0?, affine_1?, affine_2?, kept?
+//   whole      int32 marks; vec3 position, velocity, affine_0?, affine_1?, affine_2?, kept?,
+//              identity?
 //   box        int32 removed
 //   numbers    int count
 float* const columns[] = {(float*)given.position.data, (float*)given.velocity.data,
                           (float*)given.affine_0.data, (float*)given.affine_1.data,
-                          (float*)given.affine_2.data, (float*)given.kept.data};
+                          (float*)given.affine_2.data, (float*)given.kept.data,
+                          (float*)given.identity.data};
 int counts[2] = {0, 0}, to = 0;
 while (to < count && marks[to] == 0) ++to;  // particles before the first removed one stay
 for (int p = to; p < count; ++p) {
