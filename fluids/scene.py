@@ -30,8 +30,8 @@ VISCOUS_BYTES = {2: 140, 3: 220}
 MIXED_BYTES = {2: 12, 3: 20}
 # Fields of the coupled solve, its Krylov vectors, and the levels of its pressure cycle.
 STOKES_BYTES = {2: 2500, 3: 1400}
-# Numbers of new particles; position, velocity, state and scratch memory of a particle.
-WHITEWATER_CELL_BYTES, WHITEWATER_PARTICLE_BYTES = 4, 64
+# Velocity, distance and new particles of a cell; vectors and scratch memory of a particle.
+WHITEWATER_CELL_BYTES, WHITEWATER_PARTICLE_BYTES = 20, 64
 # Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
 # at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5

@@ -16,7 +16,7 @@ import warp as wp
 
 from warp_lcp.fluids import whitewater_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list, scan
-from warp_lcp.grid.particle_loops import PARTICLE
+from warp_lcp.grid.particle_loops import MARGIN, PARTICLE
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.kernels.launch_graph import clear
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
 
 # Half the thickness of the foam: a part of `length`, but at most as far as phi is known [cells].
-LAYER, LAYER_CELLS = 1.0 / 16.0, 1.0
-SAMPLE_SPACING = 0.5  # mean distance of sampled cells in a step, relative to `length`
+LAYER, LAYER_CELLS = 1.0 / 16.0, 0.5
+FAR = 1e9  # [m]
+SAMPLE_SPACING = 0.6  # mean distance of sampled cells in a step, relative to `length`
 KINDS = ("spray", "foam", "bubbles")  # of the log's columns, in the order of the kernels' numbers
 COLUMNS = (*(f"whitewater_{kind}" for kind in KINDS), "whitewater_removed")
 # Names of the particles' arrays in a checkpoint; `kept` is age, life [s] and kind.
@@ -96,11 +97,11 @@ class Whitewater:
         self.removed = 0  # in the last step, because there were too many
 
     def allocate(self, grid: StaggeredGrid) -> None:
-        """Allocate the numbers of new particles of a grid's cells."""
+        """Allocate the fields of a grid: its liquid, and numbers of new particles."""
         if grid is not self.particles.grid:
             self.particles.move_to(grid)
         self.grid = grid
-        self._ends = grid.field(wp.int32)
+        self._ends, self._centers = grid.field(wp.int32), grid.field(wp.vec4)
 
     def advance(self, liquid: LiquidSimulation, window: Window, dt: float) -> Row:
         """Emit particles, move all, and remove those whose life has ended.
@@ -116,9 +117,7 @@ class Whitewater:
         Returns:
             The values of `COLUMNS`.
         """
-        phi = liquid.surface.phi
-        assert phi is not None, "whitewater needs a level set"
-        fields = self._fields(liquid.velocity, phi, liquid.boundary)
+        fields = self._fields(liquid, window)
         self._emit(fields, window, liquid.step_count, dt)
         particles = self.particles
         if particles.count:
@@ -174,19 +173,34 @@ class Whitewater:
                 )
         self.particles.assign(arrays)
 
-    def _fields(
-        self, velocity: list[wp.array], phi: wp.array, boundary: Boundary
-    ) -> kernels.LiquidFields:
+    def _fields(self, liquid: LiquidSimulation, window: Window) -> kernels.LiquidFields:
         """Return the liquid's fields as kernels take them."""
-        grid, fields = self.grid, kernels.LiquidFields()
-        fields.planes, fields.dx = grid.planes, grid.spacing
-        fields.cut, fields.open_sides = int(boundary.distance is not None), boundary.open_sides
-        fields.origin, fields.most = wp.vec3i(*grid.origin), wp.vec3(*grid.extent)
+        grid, boundary, fields = self.grid, liquid.boundary, kernels.LiquidFields()
+        velocity, phi = liquid.velocity, liquid.surface.phi
+        assert phi is not None, "whitewater needs a level set"
+        clear(self._centers)
         # In 2-D the third component is not read.
-        fields.u, fields.v, fields.w = velocity[0], velocity[1], velocity[-1]
-        fields.phi, fields.base = phi, boundary.base
+        components = [velocity[0], velocity[1], velocity[-1]]
+        window.launch(kernels.center_kernel, [grid.planes, *components, phi, self._centers])
+        fields.planes, fields.dx = grid.planes, grid.spacing
+        fields.cut, fields.origin = int(boundary.distance is not None), wp.vec3i(*grid.origin)
+        fields.low, fields.high = (wp.vec3(*corner) for corner in self._limits(boundary))
+        fields.centers, fields.base = self._centers, boundary.base
         fields.distance = phi if boundary.distance is None else boundary.distance
         return fields
+
+    def _limits(self, boundary: Boundary) -> tuple[list[float], list[float]]:
+        """Return the smallest and largest coordinates of particles [m], far away at open sides.
+
+        In 2-D z is not limited: it stays 0.
+        """
+        margin, low, high = MARGIN * self.grid.spacing, [-FAR] * 3, [FAR] * 3
+        for axis in range(self.grid.dimension):
+            if not boundary.open_sides >> (2 * axis) & 1:
+                low[axis] = margin
+            if not boundary.open_sides >> (2 * axis + 1) & 1:
+                high[axis] = float(self.grid.extent[axis]) - margin
+        return low, high
 
     @property
     def layer(self) -> float:

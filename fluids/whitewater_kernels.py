@@ -23,21 +23,26 @@ from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.operators.grid_poisson import SOLID
 
 MODULE = "fluids.whitewater"
+CENTERS = wp.array3d(dtype=wp.vec4)
 SPRAY, FOAM, BUBBLE = 0, 1, 2  # kinds of diffuse particles
 LEAVES = 0.6  # least cosine between velocity and normal at a crest [Ihmsen et al. 2012]
+AIR = 4.0  # distance to the surface where none is stored, and the largest that is [cells]
 SPREAD = 0.15  # largest random velocity of a new particle, relative to that of the liquid
 LIFTED = 2.0  # largest height above the surface of a particle from a crest, in foam layers
 STRIDE = 0.5  # longest stride of a particle among walls [cells]
 STRIDES = 64  # most strides of a step
+ROOM = 0.5  # distance that remains to walls after a way of one stride [cells]
 BURIED = 2.0  # depth inside a solid from which a particle is removed [cells]
 
 _SOLID = wp.constant(wp.int8(SOLID))
 _LEAVES = wp.constant(LEAVES)
+_AIR = wp.constant(AIR)
 _SPREAD = wp.constant(SPREAD)
 _LIFTED = wp.constant(LIFTED)
 _STRIDE = wp.constant(STRIDE)
 _STRIDES = wp.constant(STRIDES)
 _BURIED = wp.constant(BURIED)
+_ROOM = wp.constant(ROOM)
 _MARGIN = wp.constant(MARGIN)
 _AIM = wp.constant(AIM)
 _SPRAY = wp.constant(SPRAY)
@@ -51,24 +56,22 @@ _SECOND = wp.constant(wp.uint32(0x846CA68B))
 
 @wp.struct
 class LiquidFields:
-    """Velocity, surface and solids of a step.
+    """Liquid and solids of a step.
 
-    u, v, w are the velocity's components on the faces [m/s], phi the distance to the surface
-    [cells], base the cells of solids, distance that to solids at the low corners of cells [cells],
-    used if `cut` is not 0. `origin` is the number of cells (x, y, z) before the stored ones, and
-    `most` the domain's size [m].
+    `centers` has the velocity at cell centers [m/s], and `AIR` minus the distance to the surface
+    [cells]: 0 is air, far from liquid. `base` are the cells of solids, `distance` that to solids at
+    the low corners of cells [cells], used if `cut` is not 0. `origin` is the number of cells
+    (x, y, z) before the stored ones. Particles stay between `low` and `high` [m], which are far
+    away at open sides.
     """
 
     planes: int
     cut: int
-    open_sides: int
     dx: float
     origin: wp.vec3i
-    most: wp.vec3
-    u: F32
-    v: F32
-    w: F32
-    phi: F32
+    low: wp.vec3
+    high: wp.vec3
+    centers: CENTERS
     base: I8
     distance: F32
 
@@ -145,32 +148,44 @@ def clamped_ramp(value: float, limits: wp.vec2):
 
 
 @wp.func
-def surface_distance(F: LiquidFields, X: wp.vec3):
-    """Return phi at a point [cells]; cell centers lie at i + 1/2."""
-    return interpolated(F.phi, F.planes, X[0] - 0.5, X[1] - 0.5, X[2] - 0.5)
+def liquid_at(F: LiquidFields, X: wp.vec3):
+    """Return velocity [m/s] and distance to the surface [cells] at a point.
 
-
-@wp.func
-def liquid_velocity(F: LiquidFields, X: wp.vec3):
-    """Return the velocity of the liquid at a point [m/s], linear between faces."""
-    x = interpolated(F.u, F.planes, X[0], X[1] - 0.5, X[2] - 0.5)
-    y = interpolated(F.v, F.planes, X[0] - 0.5, X[1], X[2] - 0.5)
-    z = float(0.0)
+    Linear between cell centers, which lie at i + 1/2.
+    """
+    cx = wp.clamp(X[0] - 0.5, 0.0, float(F.centers.shape[2]) - 1.001)
+    cy = wp.clamp(X[1] - 0.5, 0.0, float(F.centers.shape[1]) - 1.001)
+    i = int(cx)
+    j = int(cy)
+    k = int(1)
+    fx = cx - float(i)
+    fy = cy - float(j)
+    cz = float(1.0)
     if F.planes == 2:
-        z = interpolated(F.w, F.planes, X[0] - 0.5, X[1] - 0.5, X[2])
-    return wp.vec3(x, y, z)
+        cz = wp.clamp(X[2] - 0.5, 0.0, float(F.centers.shape[0]) - 1.001)
+        k = int(cz)
+    a = F.centers[k, j, i] * (1.0 - fx) + F.centers[k, j, i + 1] * fx
+    b = F.centers[k, j + 1, i] * (1.0 - fx) + F.centers[k, j + 1, i + 1] * fx
+    value = a * (1.0 - fy) + b * fy
+    if F.planes == 2:
+        fz = cz - float(k)
+        k += 1
+        a = F.centers[k, j, i] * (1.0 - fx) + F.centers[k, j, i + 1] * fx
+        b = F.centers[k, j + 1, i] * (1.0 - fx) + F.centers[k, j + 1, i + 1] * fx
+        value = value * (1.0 - fz) + (a * (1.0 - fy) + b * fy) * fz
+    return wp.vec3(value[0], value[1], value[2]), _AIR - value[3]
 
 
 @wp.func
 def is_stored(F: LiquidFields, X: wp.vec3):
     """Return whether a point lies in a stored cell of the domain, without the ring."""
     inside = True
-    if X[0] < 1.0 or X[0] >= float(F.phi.shape[2] - 1):
+    if X[0] < 1.0 or X[0] >= float(F.base.shape[2] - 1):
         inside = False
-    if X[1] < 1.0 or X[1] >= float(F.phi.shape[1] - 1):
+    if X[1] < 1.0 or X[1] >= float(F.base.shape[1] - 1):
         inside = False
     if F.planes == 2:
-        if X[2] < 1.0 or X[2] >= float(F.phi.shape[0] - 1):
+        if X[2] < 1.0 or X[2] >= float(F.base.shape[0] - 1):
             inside = False
     return inside
 
@@ -224,10 +239,8 @@ def emission(F: LiquidFields, E: EmissionSettings, X: wp.vec3):
     trapped = float(0.0)
     crest = float(0.0)
     normal = wp.vec3(0.0, 0.0, 0.0)
-    here = surface_distance(F, X)
-    v = wp.vec3(0.0, 0.0, 0.0)
+    v, here = liquid_at(F, X)
     if here < 1.0:
-        v = liquid_velocity(F, X)
         moving = clamped_ramp(0.5 * wp.dot(v, v), E.energy)
         if moving > 0.0:
             approach = float(0.0)
@@ -240,13 +253,14 @@ def emission(F: LiquidFields, E: EmissionSettings, X: wp.vec3):
                 Y = X + E.reach * r
                 if is_stored(F, Y):
                     if not is_solid(F, Y):
-                        share = wp.clamp(0.5 - surface_distance(F, Y), 0.0, 1.0)
+                        there, phi = liquid_at(F, Y)
+                        share = wp.clamp(0.5 - phi, 0.0, 1.0)
                         seen += 1.0
                         filled += share
                         toward += share * r
                         around += r
                         if share > 0.0:
-                            change = wp.dot(liquid_velocity(F, Y) - v, r)
+                            change = wp.dot(there - v, r)
                             approach += share * wp.max(-change, 0.0)
             if here < 0.0:
                 v_ta = 2.0 * approach / float(E.count)
@@ -268,12 +282,29 @@ def emission(F: LiquidFields, E: EmissionSettings, X: wp.vec3):
 
 
 @cell_kernel(MODULE)
+def center_kernel(k, j, i, planes: int, u: F32, v: F32, w: F32, phi: F32, centers: CENTERS):
+    """Store the mean velocity of a cell's faces and its distance to the surface together.
+
+    A particle then reads 8 vectors, not 32 numbers at four sets of places.
+    """
+    z = float(0.0)
+    if planes == 2:
+        z = 0.5 * (w[k, j, i] + w[wp.min(k + 1, w.shape[0] - 1), j, i])
+    centers[k, j, i] = wp.vec4(
+        0.5 * (u[k, j, i] + u[k, j, wp.min(i + 1, u.shape[2] - 1)]),
+        0.5 * (v[k, j, i] + v[k, wp.min(j + 1, v.shape[1] - 1), i]),
+        z,
+        _AIR - wp.clamp(phi[k, j, i], -_AIR, _AIR),
+    )
+
+
+@cell_kernel(MODULE)
 def count_kernel(k, j, i, F: LiquidFields, E: EmissionSettings, ends: I32):
     """Draw the number of new particles of each sampled cell, with the mean of `emission`."""
-    inside = i > 0 and j > 0 and k > 0 and i < F.phi.shape[2] - 1 and j < F.phi.shape[1] - 1
-    if inside and k < F.phi.shape[0] - 1:
+    inside = i > 0 and j > 0 and k > 0 and i < F.base.shape[2] - 1 and j < F.base.shape[1] - 1
+    if inside and k < F.base.shape[0] - 1:
         if F.base[k, j, i] != _SOLID:
-            if F.phi[k, j, i] < 1.0:
+            if _AIR - F.centers[k, j, i][3] < 1.5:
                 h = cell_hash(F, E, k, j, i)
                 if uniform(h, 4) < E.share:
                     X = sample_point(h, 0, 1.0, k, j, i)
@@ -320,7 +351,8 @@ def emit_kernel(
             Y = sample_point(own, 0, E.spread, k, j, i)
             if uniform(own, 3) * (trapped + crest) >= trapped:
                 height = E.layer * (1.0 + (_LIFTED - 1.0) * uniform(own, 4))
-                Y = Y + (height - surface_distance(F, Y)) * normal
+                _there, phi = liquid_at(F, Y)
+                Y = Y + (height - phi) * normal
             beside = wp.vec3(
                 2.0 * uniform(own, 5) - 1.0,
                 2.0 * uniform(own, 6) - 1.0,
@@ -354,6 +386,80 @@ def stored_point(F: LiquidFields, x: wp.vec3):
     )
 
 
+@wp.func
+def stay_inside(F: LiquidFields, x: wp.vec3, v: wp.vec3):
+    """Put a particle back into the domain, and stop it there.
+
+    Returns:
+        Position [m], velocity [m/s], and whether a side stopped it.
+    """
+    y = wp.min(wp.max(x, F.low), F.high)
+    met = int(0)
+    if wp.length_sq(y - x) > 0.0:
+        met = 1
+        v = wp.vec3(
+            wp.where(y[0] == x[0], v[0], 0.0),
+            wp.where(y[1] == x[1], v[1], 0.0),
+            wp.where(y[2] == x[2], v[2], 0.0),
+        )
+    return y, v, met
+
+
+@wp.func
+def enter_no_solid_cell(F: LiquidFields, x: wp.vec3, v: wp.vec3, stride: float):
+    """Move a particle along one axis after the other, but not into SOLID cells.
+
+    Returns:
+        Position [m], velocity [m/s], and whether a cell stopped it.
+    """
+    hit = int(0)
+    for axis in range(3):
+        e = wp.vec3(0.0, 0.0, 0.0)
+        e[axis] = v[axis]
+        y = x + stride * e
+        Y = stored_point(F, wp.min(wp.max(y, F.low), F.high))
+        barred = False
+        if is_stored(F, Y):
+            barred = is_solid(F, Y)
+        if barred:
+            v = v - e
+            hit = 1
+        else:
+            x = y
+    return x, v, hit
+
+
+@wp.func
+def keep_distance(F: LiquidFields, x: wp.vec3, v: wp.vec3):
+    """Put a particle that is too near to a solid back along the normal.
+
+    As near as the liquid's particles come. The velocity loses its part into the solid.
+
+    Returns:
+        Position [m], velocity [m/s], whether a solid stopped it, and the depth in it [cells].
+    """
+    hit = int(0)
+    depth = float(0.0)
+    Y = stored_point(F, x)
+    if is_stored(F, Y):
+        room = solid_distance(F, Y)
+        depth = -room
+        if room < _MARGIN:
+            g = wp.vec3(0.0, 0.0, 0.0)
+            for axis in range(3):
+                e = wp.vec3(0.0, 0.0, 0.0)
+                e[axis] = 0.5
+                if axis <= F.planes:
+                    g[axis] = solid_distance(F, Y + e) - solid_distance(F, Y - e)
+            size = wp.length(g)
+            if size > 1.0e-6:
+                normal = g / size
+                x = x + ((_AIM - room) * F.dx) * normal
+                v = v - wp.min(wp.dot(v, normal), 0.0) * normal
+                hit = 1
+    return x, v, hit, depth
+
+
 @list_kernel(MODULE)
 def advance_kernel(
     i,
@@ -383,74 +489,39 @@ def advance_kernel(
     h = M.dt + wp.min(age, 0.0)
     X = stored_point(F, x)
     kind = int(_SPRAY)
+    u = wp.vec3(0.0, 0.0, 0.0)
+    free = float(0.0)  # way to the nearest solid or side [cells], as far as it is known
     if is_stored(F, X):
-        height = surface_distance(F, X) * F.dx
-        if height < -M.layer:
+        u, height = liquid_at(F, X)
+        if height * F.dx < -M.layer:
             kind = _BUBBLE
-        elif height <= M.layer:
+        elif height * F.dx <= M.layer:
             kind = _FOAM
+        if F.cut != 0:
+            beside = wp.min(x - F.low, F.high - x)
+            free = wp.min(solid_distance(F, X), wp.min(beside) / F.dx)
     if kind == _SPRAY:
         v = (v + h * M.gravity) / (1.0 + h * M.air_rate)
     else:
-        u = liquid_velocity(F, X)
         if kind == _BUBBLE:
             v = (v + h * M.buoyancy + h * M.bubble_rate * u) / (1.0 + h * M.bubble_rate)
         else:
-            v = liquid_velocity(F, X + (0.5 * h / F.dx) * u)
+            v, _height = liquid_at(F, X + (0.5 * h / F.dx) * u)
     depth = float(0.0)
     stopped = int(0)
-    parts = wp.clamp(int(h * wp.length(v) / (_STRIDE * F.dx)) + 1, 1, _STRIDES)
+    way = h * wp.length(v) / F.dx
+    parts = wp.clamp(int(way / _STRIDE) + 1, 1, _STRIDES)
+    if way + _ROOM < free:  # no wall is that near
+        x = x + h * v
+        parts = 0
     for _stride in range(parts):
         stride = h / float(parts)
-        before = x
-        x = x + stride * v
-        for axis in range(F.planes + 1):  # closed sides of the domain
-            low = _MARGIN * F.dx
-            high = F.most[axis] - low
-            if x[axis] < low and (F.open_sides >> (2 * axis)) % 2 == 0:
-                x[axis] = low
-                v[axis] = wp.max(v[axis], 0.0)
-                stopped = 1
-            if x[axis] > high and (F.open_sides >> (2 * axis + 1)) % 2 == 0:
-                x[axis] = high
-                v[axis] = wp.min(v[axis], 0.0)
-                stopped = 1
-        if F.cut == 0:  # enter no SOLID cell: move along one axis after the other
-            x = before
-            for axis in range(F.planes + 1):
-                y = x
-                y[axis] = wp.clamp(
-                    y[axis] + stride * v[axis], _MARGIN * F.dx, F.most[axis] - _MARGIN * F.dx
-                )
-                if (F.open_sides >> (2 * axis)) % 4 != 0:
-                    y[axis] = x[axis] + stride * v[axis]
-                Y = stored_point(F, y)
-                barred = False
-                if is_stored(F, Y):
-                    barred = is_solid(F, Y)
-                if barred:
-                    v[axis] = 0.0
-                    stopped = 1
-                else:
-                    x = y
-        else:  # keep the distance of the liquid's particles from solids
-            Y = stored_point(F, x)
-            if is_stored(F, Y):
-                room = solid_distance(F, Y)
-                depth = -room
-                if room < _MARGIN:
-                    g = wp.vec3(0.0, 0.0, 0.0)
-                    for axis in range(F.planes + 1):
-                        e = wp.vec3(0.0, 0.0, 0.0)
-                        e[axis] = 0.5
-                        g[axis] = solid_distance(F, Y + e) - solid_distance(F, Y - e)
-                    size = wp.length(g)
-                    if size > 1.0e-6:
-                        normal = g / size
-                        x = x + ((_AIM - room) * F.dx) * normal
-                        into = wp.dot(v, normal)
-                        v = v - wp.min(into, 0.0) * normal
-                        stopped = 1
+        if F.cut == 0:
+            x, v, hit = enter_no_solid_cell(F, x, v, stride)
+        else:
+            x, v, hit, depth = keep_distance(F, x + stride * v, v)
+        x, v, met = stay_inside(F, x, v)
+        stopped += hit + met
     if kind == _FOAM or stopped > 0:
         life -= h
     marks[i] = 0
