@@ -17,8 +17,9 @@ CELLS = 4  # default length in an unbounded domain [cells]
 GRAVITY = 9.81  # for default speeds without gravity [m/s^2]
 # Default ranges of speeds, in units of sqrt(g length), so that scenes of all sizes look alike.
 SPEEDS = {"trapped_air": (0.2, 1.5), "speed": (1.0, 3.0)}
-# Default rates: particles per length^3 (length^2) of liquid and second, and per area of crests.
-TRAPPED_AIR_RATE, CREST_RATE = 1e4, 1e3
+# Default rates by dimension d: particles per length^d of liquid and second, and per length^(d - 1)
+# of crests.
+TRAPPED_AIR_RATE, CREST_RATE = {2: 1e4, 3: 6e4}, {2: 1e3, 3: 6e3}
 
 
 def _is_range(limits: list[float]) -> list[float]:
@@ -61,12 +62,12 @@ class WhitewaterSettings(Table):
     trapped_air_rate: NonNegative | None = Field(
         default=None,
         description="new particles per volume of liquid and second [1/(m^3 s); 1/(m^2 s) in 2-D]; "
-        "default: 10,000 / length^3, 2-D: / length^2",
+        "default: 60,000 / length^3, 2-D: 10,000 / length^2",
     )
     crest_rate: NonNegative | None = Field(
         default=None,
         description="new particles per area of crests and second [1/(m^2 s); 1/(m s) in 2-D]; "
-        "default: 1000 / length^2, 2-D: / length",
+        "default: 6000 / length^2, 2-D: 1000 / length",
     )
     lifetime: Positive = Field(default=2.0, description="mean life of a particle as foam [s]")
     buoyancy: NonNegative = Field(
@@ -102,9 +103,11 @@ class WhitewaterSettings(Table):
             "length": length,
             "speed": self.speed or low["speed"],
             "trapped_air": self.trapped_air or low["trapped_air"],
-            "trapped_air_rate": TRAPPED_AIR_RATE / length**dimension
+            "trapped_air_rate": TRAPPED_AIR_RATE[dimension] / length**dimension
             if trapped is None
             else trapped,
-            "crest_rate": CREST_RATE / length ** (dimension - 1) if crest is None else crest,
+            "crest_rate": CREST_RATE[dimension] / length ** (dimension - 1)
+            if crest is None
+            else crest,
         }
         return self.model_copy(update=values)
