@@ -114,7 +114,7 @@ def make_tension(
 
 def make_whitewater(scene: LiquidScene, grid: StaggeredGrid) -> Whitewater | None:
     """Return the whitewater of a scene, or None without the table or a free surface."""
-    if scene.whitewater is None or scene.stays_full:
+    if not scene.has_whitewater:
         return None
     # Imported here, so that other scenes compile and import nothing of it.
     from warp_lcp.fluids.whitewater import Whitewater

@@ -359,6 +359,11 @@ class LiquidScene(ParticleScene):
         )
 
     @property
+    def has_whitewater(self) -> bool:
+        """Return whether the scene has whitewater and a free surface."""
+        return self.whitewater is not None and not self.stays_full
+
+    @property
     def drags(self) -> list[float] | None:
         """Return c_f of the domain's walls and of each solid; None without wall drag.
 
@@ -478,7 +483,7 @@ class LiquidScene(ParticleScene):
             * TENSION_BYTES
             * (self.surface_tension is not None and not self.stays_full),
             "whitewater": 0
-            if self.whitewater is None or self.stays_full
+            if self.whitewater is None or not self.has_whitewater
             else cells * WHITEWATER_CELL_BYTES
             + self.whitewater.max_particles * WHITEWATER_PARTICLE_BYTES,
         }
