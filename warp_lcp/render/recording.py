@@ -250,7 +250,8 @@ class Recording:
         if self.show is VisiblePart.BODIES or not file.is_file():
             return None
         points = self._points("whitewater", number)
-        if len(points.points) and np.shape(points.fields.get("kind")) != (len(points.points),):
+        kinds = points.fields.get("kind")
+        if kinds is None or kinds.shape != (len(points.points),):
             raise RenderError(f"{file}: is not a readable frame: it has no kind of each particle")
         return points
 
