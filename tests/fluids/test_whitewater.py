@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,15 @@ import warp as wp
 import small_liquids
 from small_liquids import box, create, scene
 from small_runs import StepCounter, run_into, written_files
+from warp_lcp.extras.usd import export_run
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.fluids import whitewater_kernels as kernels
 from warp_lcp.fluids.whitewater import COLUMNS, KINDS, STATE, directions
 from warp_lcp.fluids.whitewater_table import WhitewaterSettings
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels.compiler import forward_kernel
+from warp_lcp.render.recording import Recording
+from warp_lcp.render.section import Section
 from warp_lcp.scene.scene_file import load_scene
 from warp_lcp.scene.table import SceneError
 from warp_lcp.simulation import Points
@@ -466,3 +470,51 @@ def test_the_expected_number_is_that_of_rate_volume_and_time() -> None:
     one, halves = born(0.02, 1), born(0.02, 2)
     assert one > 20
     assert halves == pytest.approx(one, rel=0.08)  # four standard deviations
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a short run with whitewater."""
+    folder = tmp_path_factory.mktemp("whitewater") / "run"
+    keys = ["domain.resolution=32", "time.duration=0.6", "whitewater.trapped_air_rate=1e6"]
+    run_into(load_scene("dam-break-2d", keys), folder, observer=StepCounter())
+    return folder
+
+
+def test_recorded_frames_have_whitewater(run_folder: Path) -> None:
+    recording = Recording(run_folder)
+    last = recording.whitewater(recording.numbers[-1])
+    assert last is not None
+    assert len(last.points) > 10
+    assert set(np.unique(last.fields["kind"])) <= {SPRAY, FOAM, BUBBLE}
+    files = [file.name for file in recording.files(recording.numbers[-1])]
+    assert f"whitewater_{recording.numbers[-1]:06d}.vtu" in files
+    assert Recording(run_folder).frame(0).whitewater is not None
+
+
+def test_sections_draw_whitewater(run_folder: Path) -> None:
+    pytest.importorskip("matplotlib")
+    recording = Recording(run_folder, cells=True)
+    section = Section(recording, (320, 160))
+    frame = recording.frame(recording.numbers[-1])
+    bare = section.draw(replace(frame, whitewater=None))
+    assert (section.draw(frame) != bare).any()
+
+
+def test_usd_has_kinds(run_folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdGeom
+
+    file = tmp_path / "run.usda"
+    numbers = list(export_run(run_folder, file))
+    stage = Usd.Stage.Open(str(file))
+    prim = next(p for p in stage.Traverse() if p.GetName() == "whitewater")
+    points, code = UsdGeom.Points(prim), float(numbers[-1])
+    kinds = UsdGeom.PrimvarsAPI(prim).GetPrimvar("kind")
+    ages = UsdGeom.PrimvarsAPI(prim).GetPrimvar("age")
+    recorded = Recording(run_folder).whitewater(numbers[-1])
+    assert recorded is not None
+    np.testing.assert_array_equal(np.array(kinds.Get(code)), recorded.fields["kind"])
+    np.testing.assert_allclose(np.array(ages.Get(code)), recorded.fields["age"])
+    np.testing.assert_allclose(np.array(points.GetPointsAttr().Get(code)), recorded.points)
+    assert len(points.GetVelocitiesAttr().Get(code)) == len(recorded.points)
