@@ -24,6 +24,7 @@ from warp_lcp.rigid.bodies import RigidBodies
 
 if TYPE_CHECKING:
     from warp_lcp.fluids.simulator import LiquidSimulation
+    from warp_lcp.fluids.whitewater import Whitewater
 
 
 class LiquidModel(Protocol):
@@ -109,6 +110,16 @@ def make_tension(
         contact_angle=angle,
         density=density,
     )
+
+
+def make_whitewater(scene: LiquidScene, grid: StaggeredGrid) -> Whitewater | None:
+    """Return the whitewater of a scene, or None without the table or a free surface."""
+    if not scene.has_whitewater:
+        return None
+    # Imported here, so that other scenes compile and import nothing of it.
+    from warp_lcp.fluids.whitewater import Whitewater
+
+    return Whitewater(scene, grid)
 
 
 def make_pressure(

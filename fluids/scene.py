@@ -9,6 +9,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from warp_lcp.fluids.drag_and_probe_tables import Probe, WallDragSettings, probe_errors
+from warp_lcp.fluids.whitewater_table import WhitewaterSettings
 from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.scene.models import SceneModel
 from warp_lcp.scene.scene import CrossKeyError, Liquid, Table
@@ -29,6 +30,8 @@ VISCOUS_BYTES = {2: 140, 3: 220}
 MIXED_BYTES = {2: 12, 3: 20}
 # Fields of the coupled solve, its Krylov vectors, and the levels of its pressure cycle.
 STOKES_BYTES = {2: 2500, 3: 1400}
+# Velocity, distance and new particles of a cell; vectors and scratch memory of a particle.
+WHITEWATER_CELL_BYTES, WHITEWATER_PARTICLE_BYTES = 20, 64
 # Courant numbers below this are short steps: liquid poured over a mesh gained energy without bound
 # at 1/4 on 40 cells, at 1/8 on 20.
 SHORT_STEPS = 0.5
@@ -105,7 +108,7 @@ def _viscosity(shape: Shape) -> float | None:
 class LiquidScene(ParticleScene):
     """Scene of liquid.
 
-    The tables of all materials, and `pressure`, `viscosity`, `surface_tension` and `liquid`.
+    The tables of all materials, and those of liquids: `pressure`, `viscosity` and others.
     """
 
     solve_bytes: ClassVar[int] = PRESSURE_BYTES
@@ -120,6 +123,7 @@ class LiquidScene(ParticleScene):
     liquid: list[Liquid] = Field(default_factory=list)
     probe: list[Probe] = Field(default_factory=list)
     wall_drag: WallDragSettings | None = None
+    whitewater: WhitewaterSettings | None = None
 
     def materials(self) -> tuple[str, Sequence[MaterialProperties]]:
         """Return the key `liquid` and its shapes."""
@@ -161,6 +165,9 @@ class LiquidScene(ParticleScene):
                 "that may be negative"
             )
             errors.append(CrossKeyError(("surface_tension",), None, message))
+        if self.whitewater is not None and self.pressure.surface == "voxel":
+            message = 'needs pressure.surface = "ghost-fluid", whose surface has a distance'
+            errors.append(CrossKeyError(("whitewater",), None, message))
         return [
             *errors,
             *self._viscosity_errors(),
@@ -336,6 +343,9 @@ class LiquidScene(ParticleScene):
                     "[wall_drag]" if self.wall_drag is not None else "drag of a solid",
                 )
             )
+        if self.whitewater is not None:
+            why = closed if full else "[whitewater]"
+            models.append(SceneModel("whitewater", why, built=not full))
         return [*models, *super().models()]
 
     @property
@@ -347,6 +357,11 @@ class LiquidScene(ParticleScene):
             and math.isfinite(settings.splitting_tolerance)
             and self.pressure.model == "incompressible"
         )
+
+    @property
+    def has_whitewater(self) -> bool:
+        """Return whether the scene has whitewater and a free surface."""
+        return self.whitewater is not None and not self.stays_full
 
     @property
     def drags(self) -> list[float] | None:
@@ -467,4 +482,8 @@ class LiquidScene(ParticleScene):
             "surface tension": cells
             * TENSION_BYTES
             * (self.surface_tension is not None and not self.stays_full),
+            "whitewater": 0
+            if self.whitewater is None or not self.has_whitewater
+            else cells * WHITEWATER_CELL_BYTES
+            + self.whitewater.max_particles * WHITEWATER_PARTICLE_BYTES,
         }

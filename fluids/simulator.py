@@ -18,6 +18,7 @@ from warp_lcp.fluids.models import (
     make_surface,
     make_tension,
     make_viscosity,
+    make_whitewater,
 )
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
@@ -77,6 +78,7 @@ class LiquidSimulation(ParticleSimulation):
         surface: the free surface.
         forces: force output of each solid; None if off.
         tension: surface tension; None if off.
+        whitewater: spray, foam and bubbles; None if off.
         projection: the pressure solve and its fields.
         record: callback that gets the problem of each step before its solve; optional.
     """
@@ -97,6 +99,7 @@ class LiquidSimulation(ParticleSimulation):
         tell = scene.output.forces or (scene.drags is not None and more.get("bodies") is not None)
         self.models = tuple(models)
         self.forces = SolidForces(solids, grid.dimension) if tell else None
+        self.whitewater = make_whitewater(scene, grid)
         super().__init__(scene, grid, parts, particles, **more)
         self.record: Callable[[Mapping[str, np.ndarray]], object] | None = None
         self.reach = max(
@@ -154,6 +157,8 @@ class LiquidSimulation(ParticleSimulation):
             self.projection,
             self.bodies,
         )
+        if self.whitewater is not None:
+            self.whitewater.allocate(grid)
         # Airborne momentum and spray corrections assume gravity alone.
         if self.models:
             self.flights = None
@@ -240,8 +245,10 @@ class LiquidSimulation(ParticleSimulation):
         self.grid_to_particles(window, self.projection.kind, dt)
         if self.tension is not None:
             self.tension.damp_velocity_gradients(self.particles, dt)
+        liquid_cells = window.now  # the move changes the active window
         row = (
             self.move(dt, window, self.surface.density, self.projection.contact)
+            | self._advance_whitewater(liquid_cells, dt)
             | self.solve_row(projected.result)
             | viscous
             | walls
@@ -274,6 +281,13 @@ class LiquidSimulation(ParticleSimulation):
             for name, found in measured.items()
             if found is not None
         }
+
+    def _advance_whitewater(self, window: Window, dt: float) -> Row:
+        """Move spray, foam and bubbles after a step; return their log values."""
+        if self.whitewater is None:
+            return Row()
+        with self.watch.stage("whitewater", self.whitewater.particles.position, *self.velocity):
+            return self.whitewater.advance(self, window, dt)
 
     def _measure(self) -> None:
         """Fill the rows of the tables, if any."""
@@ -326,7 +340,8 @@ class LiquidSimulation(ParticleSimulation):
         criterion, and time_error [m/s], the velocity error due to the length of the step. With
         viscosity: iterations and residual of its solve, the energy dissipated in the step, and the
         work of moving walls on the liquid [J; J/m in 2-D]. With wall drag: drag_work, the energy
-        that it takes from the liquid in the step [J; J/m in 2-D].
+        that it takes from the liquid in the step [J; J/m in 2-D]. With whitewater: particles of
+        each kind, and those removed in the step because there were too many.
         """
         model_columns = tuple(name for model in self.models for name in model.columns)
         drags = ("drag_work",) if self.scene.drags is not None else ()
@@ -340,7 +355,8 @@ class LiquidSimulation(ParticleSimulation):
         columns = columns if self.viscosity is None else (*columns, *VISCOUS_COLUMNS)
         columns = columns if self.stokes is None else (*columns, *STOKES_COLUMNS)
         automatic = () if self.projection.automatic is None else ("tolerance", "time_error")
-        return (*columns, *automatic, *model_columns)
+        whitewater = () if self.whitewater is None else self.whitewater.columns
+        return (*columns, *automatic, *whitewater, *model_columns)
 
     def frame(self) -> list[Part]:
         """Return the parts of a frame: particles, liquid cells, surface and volume.
@@ -373,6 +389,7 @@ class LiquidSimulation(ParticleSimulation):
                 self.image_counts,
                 grid.part.corners,
             ),
+            *([] if self.whitewater is None else [self.whitewater.points()]),
             *self.surfaces(),
             *self.volumes(),
             *self.body_surfaces(),
@@ -388,6 +405,16 @@ class LiquidSimulation(ParticleSimulation):
         self.projection.restore(dict(state))
         if self.stokes is not None:
             self.stokes.restore(state)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Return the arrays of a checkpoint, with those of whitewater."""
+        return super().state() | ({} if self.whitewater is None else self.whitewater.state())
+
+    def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
+        """Continue with the time, the bodies and the whitewater of a state."""
+        if self.whitewater is not None:
+            self.whitewater.restore(state)
+        super()._take_clock(state)
 
     def _find_surface(self, window: Window) -> None:
         """Mark liquid cells, set their face velocities, and apply surface tension."""
@@ -756,6 +783,7 @@ class FluidsSimulator:
                     ranks,
                     device,
                     methods=METHODS_ON_RANKS,
+                    refused=() if scene.whitewater is None else ("whitewater",),
                     smoothing=scene.pressure.smoothing,
                 ).grid,
             )

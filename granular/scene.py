@@ -225,7 +225,7 @@ def _true_errors(rules: Iterable[tuple[object, str, object, str]]) -> list[Cross
 class SandScene(ParticleScene):
     """Scene of sand."""
 
-    elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids"}
+    elsewhere: ClassVar = {"liquid": "fluids", "pressure": "fluids", "whitewater": "fluids"}
     palette: ClassVar = "sand"
     solve_bytes: ClassVar[int] = STRESS_BYTES[3]
     # Sand at rest has 1e-5; its pressure does not push overlapping particles apart.

@@ -198,6 +198,13 @@ CASES = {
         modules=("fluids.surface_tension",),
         files=("fluids/surface_tension.py",),
     ),
+    "whitewater": OnOffModel(
+        {"pressure": {}, "whitewater": {}},
+        {"pressure": {}},
+        modules=("fluids.whitewater",),
+        files=("fluids/whitewater.py",),
+        columns=("whitewater_spray", "whitewater_foam", "whitewater_bubbles"),
+    ),
     "separating walls": OnOffModel(
         {"wall": "separating"}, modules=("warp_lcp.bounds",), files=("warp_lcp/problem/bounds.py",)
     ),

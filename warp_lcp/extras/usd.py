@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from warp_lcp.grid.motion import Motion
-from warp_lcp.render.actors import BODY_COLORS, SURFACES
+from warp_lcp.render.actors import BODY_COLORS, SURFACES, WHITEWATER, WHITEWATER_RADIUS
 from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE
 from warp_lcp.render.recording import Recording, ids_of
 from warp_lcp.render.solid_meshes import SOLID, prescribed_solids
@@ -84,7 +84,12 @@ class UsdStage:
         self._surface = self._shape("surface", color) if recording.show in WITH_SURFACE else None
         if self._surface is not None and self._dimension == 3:
             self._surface.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        self._particles = self._points(color) if recording.show in WITH_PARTICLES else None
+        self._particles = (
+            self._points("particles", color, self._spacing)
+            if recording.show in WITH_PARTICLES
+            else None
+        )
+        self._whitewater = self._whitewater_points(numbers[0])
         self._moving = self._solids()
         self._bodies: dict[int, tuple[np.ndarray, UsdGeom.XformOp]] = {}
 
@@ -113,6 +118,7 @@ class UsdStage:
             )
             if self._recording.scene.output.ids:
                 self._set_ids(self._particles, particles, code)
+        self._set_whitewater(number, code)
         if (bodies := self._recording.bodies(number)) is not None:
             self._set_bodies(bodies, code)
         for motion, place in self._moving:
@@ -180,12 +186,44 @@ class UsdStage:
         shape.CreateDisplayColorAttr(_color(color))
         return shape
 
-    def _points(self, color: str) -> UsdGeom.Points:
-        """Define the particles."""
+    def _whitewater_points(self, number: int) -> UsdGeom.Points | None:
+        """Define spray, foam and bubbles, if a frame has them, with `kind` and `age` [s]."""
+        from pxr import Sdf, UsdGeom
+
+        if self._recording.whitewater(number) is None:
+            return None
+        width = 2.0 * WHITEWATER_RADIUS * self._recording.scene.spacing
+        points = self._points("whitewater", WHITEWATER[0], width)
+        values = UsdGeom.PrimvarsAPI(points)
+        for name, kind in (
+            ("kind", Sdf.ValueTypeNames.IntArray),
+            ("age", Sdf.ValueTypeNames.FloatArray),
+        ):
+            values.CreatePrimvar(name, kind, UsdGeom.Tokens.vertex)
+        return points
+
+    def _set_whitewater(self, number: int, code: float) -> None:
+        """Set spray, foam and bubbles of a frame: `kind` is 0, 1 or 2."""
+        from pxr import UsdGeom, Vt
+
+        found = self._recording.whitewater(number)
+        if self._whitewater is None or found is None:
+            return
+        width = 2.0 * WHITEWATER_RADIUS * self._recording.scene.spacing
+        velocity = found.fields.get("velocity")
+        _set_points(self._whitewater, found.points, code, velocity, width)
+        values, count = UsdGeom.PrimvarsAPI(self._whitewater), len(found.points)
+        kinds = np.asarray(found.fields.get("kind", np.zeros(count)))
+        ages = np.asarray(found.fields.get("age", np.zeros(count)), dtype=np.float32)
+        values.GetPrimvar("kind").Set(_integers(kinds), code)
+        values.GetPrimvar("age").Set(Vt.FloatArray.FromNumpy(np.ascontiguousarray(ages)), code)
+
+    def _points(self, name: str, color: str, width: float) -> UsdGeom.Points:
+        """Define points of one width [m]."""
         from pxr import UsdGeom
 
-        points = UsdGeom.Points.Define(self._stage, f"{self._root}/particles")
-        _set_width(points, self._spacing)
+        points = UsdGeom.Points.Define(self._stage, f"{self._root}/{name}")
+        _set_width(points, width)
         points.CreateDisplayColorAttr(_color(color))
         return points
 

@@ -50,6 +50,9 @@ SURFACES: dict[str, MeshStyle] = {  # in 3-D, by `Scene.palette`
 FILLS = {"water": ["#1254a2", "#78c4ee"], "sand": ["#aa7c46", "#deb87a"]}
 OUTLINES = {"water": "#0c3e80", "sand": "#78522a"}
 
+# Spray, foam and bubbles, and the radius of a particle [cells].
+WHITEWATER, WHITEWATER_RADIUS = ["#ffffff", "#ffffff", "#dcefff"], 0.13
+
 # Shadows are blue for water, brown for sand.
 SHADES = {"water": np.array([1.4, 1.0, 0.7]), "sand": np.array([1.1, 1.3, 1.5])}
 SHEENS = {"water": 0.35, "sand": 0.0}  # brightness of the lamp's specular reflection; 0 for sand

@@ -14,6 +14,8 @@ import numpy as np
 from warp_lcp.grid.motion import Pose
 from warp_lcp.render.actors import (
     SHADES,
+    WHITEWATER,
+    WHITEWATER_RADIUS,
     Actors,
     MeshStyle,
     StyledMesh,
@@ -65,6 +67,13 @@ ambientColor *= light;
 diffuseColor *= light;
 """
 )
+
+SPLATS: MeshStyle = {
+    "style": "points_gaussian",
+    "emissive": False,
+    "render_points_as_spheres": True,
+    "lighting": False,
+}
 
 
 class Picture:
@@ -164,6 +173,9 @@ class Picture:
         for actor in self.actors.exchange("particles", particles):
             actor.mapper.SetSplatShaderCode(DISC if self.flat else GRAIN if self.grainy else BALL)
             actor.mapper.scale_factor = radius
+        for actor in self.actors.exchange("whitewater", self._whitewater(frame)):
+            actor.mapper.SetSplatShaderCode(DISC)
+            actor.mapper.scale_factor = WHITEWATER_RADIUS * self.scene.spacing
 
     def draw(self, frame: RecordedFrame) -> np.ndarray:
         """Return an image of a frame."""
@@ -277,12 +289,20 @@ class Picture:
                 )
         if self.grainy:
             points, colors, radius = grains(points, colors, self.spacing, self.scene.domain.size)
-        looks: MeshStyle = {
-            "style": "points_gaussian",
-            "emissive": False,
-            "render_points_as_spheres": True,
-            "lighting": False,
-        }
         return [
-            (pyvista.PolyData(points), {"scalars": colors.astype(np.uint8), "rgb": True, **looks})
+            (pyvista.PolyData(points), {"scalars": colors.astype(np.uint8), "rgb": True, **SPLATS})
         ], radius
+
+    def _whitewater(self, frame: RecordedFrame) -> list[StyledMesh]:
+        """Return spray, foam and bubbles as discs, in 2-D in front of the liquid."""
+        import pyvista
+        from matplotlib.colors import to_rgb
+
+        if frame.whitewater is None or not len(frame.whitewater.points):
+            return []
+        points = np.array(frame.whitewater.points, dtype=np.float64)
+        if self.flat:
+            points[:, 2] = 0.5 * self.front
+        palette = (255.0 * np.array([to_rgb(color) for color in WHITEWATER])).astype(np.uint8)
+        kinds = np.clip(frame.whitewater.fields["kind"].astype(int), 0, len(palette) - 1)
+        return [(pyvista.PolyData(points), {"scalars": palette[kinds], "rgb": True, **SPLATS})]

@@ -51,6 +51,7 @@ class RecordedFrame:
         bodies: current surfaces of rigid bodies, with the field `body`; None if the scene has none.
         cells: cells with their fields; None if not shown.
         ids: ids of the particles, int64, shape (n,); None if the frame has none.
+        whitewater: spray, foam and bubbles with the field `kind`; None if the run has none.
     """
 
     time: float
@@ -60,6 +61,7 @@ class RecordedFrame:
     bodies: Surface | None = None
     cells: Cells | None = None
     ids: np.ndarray | None = None
+    whitewater: Points | None = None
 
 
 ContentT = TypeVar("ContentT", VtuMesh, Cells)
@@ -220,6 +222,7 @@ class Recording:
             self.bodies(number),
             filled,
             ids,
+            self.whitewater(number),
         )
 
     def surface(self, number: int) -> Surface:
@@ -236,13 +239,31 @@ class Recording:
         Raises:
             RenderError: the file cannot be read.
         """
-        mesh = _read(self._file("particles", number), VtuMesh)
+        return self._points("particles", number)
+
+    def whitewater(self, number: int) -> Points | None:
+        """Return spray, foam and bubbles of a frame, with the field `kind`.
+
+        Returns None if the run has none, or if only bodies are shown.
+
+        Raises:
+            RenderError: the file cannot be read, or has no kinds.
+        """
+        file = self._file("whitewater", number)
+        if self.show is VisiblePart.BODIES or not file.is_file():
+            return None
+        points = self._points("whitewater", number)
+        kinds = points.fields.get("kind")
+        if kinds is None or kinds.shape != (len(points.points),):
+            raise RenderError(f"{file}: is not a readable frame: it has no kind of each particle")
+        return points
+
+    def _points(self, name: str, number: int) -> Points:
+        """Return the points of a part with finite positions, and their fields."""
+        mesh = _read(self._file(name, number), VtuMesh)
         finite = np.isfinite(mesh.points).all(axis=1)
-        return Points(
-            "particles",
-            mesh.points[finite],
-            {name: values[finite] for name, values in mesh.fields.items()},
-        )
+        fields = {field: values[finite] for field, values in mesh.fields.items()}
+        return Points(name, mesh.points[finite], fields)
 
     def bodies(self, number: int) -> Surface | None:
         """Return the surfaces of the rigid bodies in a frame; None if the run has none.
@@ -413,14 +434,15 @@ class Recording:
         return cells
 
     def files(self, number: int) -> list[Path]:
-        """Return the files of a frame's particles or surface, and bodies."""
+        """Return the files of a frame's particles or surface, whitewater and bodies."""
         parts = {
             VisiblePart.PARTICLES: ["particles"],
             VisiblePart.SURFACE: ["surface"],
             VisiblePart.BOTH: ["particles", "surface"],
             VisiblePart.BODIES: [],
         }
-        files = [self._file(part, number) for part in [*parts[self.show], "bodies"]]
+        beside = ["bodies"] if self.show is VisiblePart.BODIES else ["bodies", "whitewater"]
+        files = [self._file(part, number) for part in [*parts[self.show], *beside]]
         # Files of ranks.
         pieces = [
             piece for file in files for piece in sorted(file.parent.glob(f"rank_*/{file.stem}.*"))

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from warp_lcp.grid.motion import Pose
-from warp_lcp.render.actors import BODY_COLORS, BODY_EDGE
+from warp_lcp.render.actors import BODY_COLORS, BODY_EDGE, WHITEWATER
 from warp_lcp.render.image_content import Color, RenderError
 from warp_lcp.render.recording import RecordedFrame, Recording
 from warp_lcp.render.solid_meshes import EDGE, nearest_distance, prescribed_solids
@@ -75,6 +75,7 @@ class Section:
         if frame.surface is not None:
             self._draw_lines(axes, frame.surface, LINE)
         self._draw_particles(axes, frame)
+        self._draw_whitewater(axes, frame)
         if frame.bodies is not None:
             self._fill_bodies(axes, frame.bodies)
         camera = self.scene.camera
@@ -213,6 +214,26 @@ class Section:
                 c=colors,
                 linewidths=0.0,
                 zorder=3,
+            )
+
+    def _draw_whitewater(self, axes: Axes, frame: RecordedFrame) -> None:
+        """Draw spray, foam and bubbles within half a cell of the plane, with an edge."""
+        if frame.whitewater is None:
+            return
+        points = frame.whitewater.points
+        kinds = np.clip(frame.whitewater.fields["kind"].astype(int), 0, len(WHITEWATER) - 1)
+        for kind, color in enumerate(WHITEWATER):
+            near = kinds == kind
+            if self.at is not None:
+                near &= np.abs(points[:, 2] - self.at) < 0.5 * self.scene.spacing
+            axes.scatter(
+                points[near, 0],
+                points[near, 1],
+                s=SMALLEST_DOT**2,
+                color=color,
+                edgecolors=DOT,
+                linewidths=0.25,
+                zorder=4,
             )
 
 

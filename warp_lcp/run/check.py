@@ -129,6 +129,7 @@ def check_output(scene: Scene) -> list[str]:
     has_bodies, cells = any(solid.is_body for solid in scene.solid), output.grid_format == "vtu"
     kinds: dict[str, tuple[bool, type, int]] = {
         "particles": (output.particles, Points, 3),
+        "whitewater": (scene.has_whitewater, Points, 3),
         "grid": (output.grid and cells, Cells, scene.dimension),
         "surface": (output.surface, Surface, scene.dimension),
         "the surfaces of bodies": (has_bodies, Surface, scene.dimension),

@@ -395,6 +395,11 @@ class Scene(Table):
         return self.domain.spacing or max(self.domain.size) / self.domain.resolution
 
     @property
+    def has_whitewater(self) -> bool:
+        """Return whether frames have spray, foam and bubbles."""
+        return False
+
+    @property
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and high corner [m] of the region in pictures, shape (3,).
 

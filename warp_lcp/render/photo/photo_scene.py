@@ -16,7 +16,7 @@ from warp_lcp.grid.motion import Pose
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.grid.surface_mesh import SurfaceMesh
 from warp_lcp.material.particle_scene import ParticleScene
-from warp_lcp.render.actors import BODY_COLORS, is_round
+from warp_lcp.render.actors import BODY_COLORS, WHITEWATER_RADIUS, is_round
 from warp_lcp.render.grains import placed_grains
 from warp_lcp.render.image_content import RenderError, VisiblePart
 from warp_lcp.render.photo.meshes import (
@@ -52,6 +52,7 @@ SAND_SHARES = np.array([0.45, 0.30, 0.15, 0.10])
 SOLID = np.array([0.36, 0.38, 0.41])
 PALE = np.array([0.82, 0.80, 0.76])  # reflectance of every other wedge of balls
 WEDGES = 6
+FOAM = np.array([0.92, 0.93, 0.94])  # reflectance of spray, foam and bubbles
 
 
 class SurfaceFinish(StrEnum):
@@ -173,6 +174,7 @@ class PhotoScenes:
             )
         elif self.recording.show is VisiblePart.PARTICLES:
             meshes += self._grains(number)
+        meshes += self._whitewater(number)
         return PhotoScene(meshes, self.view, 0.0, np.array(self._scene.domain.size))
 
     def _material(self, surface: Surface, distance: Distance | None) -> list[PhotoMesh]:
@@ -226,6 +228,20 @@ class PhotoScenes:
         )
         normals = smooth_normals(points, corners).astype(np.float32) if fine else None
         return [PhotoMesh("grains", points, corners, SurfaceFinish.MATTE, color, normals, moved)]
+
+    def _whitewater(self, number: int) -> list[PhotoMesh]:
+        """Return spray, foam and bubbles as white beads, in one mesh."""
+        particles = self.recording.whitewater(number)
+        if particles is None or not len(particles.points):
+            return []
+        seeds = np.arange(len(particles.points))
+        radius = WHITEWATER_RADIUS * self._scene.spacing
+        points, corners, own = grain_mesh(
+            np.asarray(particles.points, dtype=np.float64), radius, seeds, 0
+        )
+        velocity = particles.fields.get("velocity")
+        moved = None if velocity is None else np.asarray(velocity, dtype=np.float32)[own]
+        return [PhotoMesh("whitewater", points, corners, SurfaceFinish.MATTE, FOAM, velocity=moved)]
 
     def _solid_meshes(self, time: float) -> list[PhotoMesh]:
         """Return the prescribed solids, cut at the domain; containers are invisible."""
