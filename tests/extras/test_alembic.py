@@ -142,6 +142,25 @@ def test_an_archive_has_what_the_frames_have(dots, tmp_path, ids):
             np.testing.assert_array_equal(array(values), frame.point_data["age"].ravel()[order])
 
 
+def test_whitewater_has_kinds(dots, tmp_path):
+    frames = []
+    for number in range(2):
+        drops = np.linspace(0.1, 0.9, 3 * (4 + number), dtype=np.float32).reshape(-1, 3)
+        kind = np.arange(len(drops), dtype=np.uint8) % 3
+        fields = {"velocity": moved(drops, number), "kind": kind}
+        frames.append([ball([0.5, 0.5, 0.5], 0.1), Points("whitewater", drops, fields)])
+    folder = write_run(tmp_path / "run", frames, size=ROOM)
+    archive = exported(folder, tmp_path / "run.abc")
+    assert archive.names == ["surface", "whitewater"]
+    points = AbcGeom.IPoints(archive.top, "whitewater").getSchema()
+    kinds = AbcGeom.IFloatGeomParam(points.getArbGeomParams(), "kind")
+    for number, (_, drops) in enumerate(frames):
+        found = at(points, number / RATE)
+        np.testing.assert_array_equal(array(found.getPositions()), drops.points)
+        values = kinds.getExpandedValue(Abc.ISampleSelector(number / RATE)).getVals()
+        np.testing.assert_array_equal(array(values), drops.fields["kind"])
+
+
 def test_ids_that_alembic_cannot_hold(dots, tmp_path):
     points = np.zeros((2, 3), dtype=np.float32)
     drops = Points("particles", points, {"id": np.array([1, 2**31], dtype=np.int64)})

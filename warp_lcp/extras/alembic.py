@@ -17,6 +17,7 @@ import numpy as np
 
 from warp_lcp.extras.usd import LINE_WIDTH, split_bodies, vertex_normals
 from warp_lcp.grid.motion import Motion
+from warp_lcp.render.actors import WHITEWATER_RADIUS
 from warp_lcp.render.image_content import WITH_PARTICLES, WITH_SURFACE, RenderError
 from warp_lcp.render.recording import Recording
 from warp_lcp.render.solid_meshes import prescribed_solids
@@ -39,7 +40,7 @@ SUFFIXES = (".abc",)
 CLOSING_BYTES = 2**16, 2**11  # written when an archive is closed, at most: in all, and per frame
 STATIC = 0  # number of the time sampling of what does not move
 MOST_IDS = 2**31
-NUMBERS = ("age",)  # fields of points that are written, one number a point
+NUMBERS = ("age", "kind")  # fields of points that are written, one number a point
 ArrayT = TypeVar("ArrayT")
 
 
@@ -94,6 +95,10 @@ class AlembicArchive:
             self._particles = PointsObject(
                 self._top, "particles", self._samples, recording.particle_spacing()
             )
+        self._whitewater: PointsObject | None = None
+        if recording.whitewater(numbers[0]) is not None:
+            width = 2.0 * WHITEWATER_RADIUS * scene.spacing
+            self._whitewater = PointsObject(self._top, "whitewater", self._samples, width)
         self._static: list[OPolyMesh | OCurves] = []  # shapes that are closed with the archive
         self._moving = self._solids()
         self._bodies: dict[int, tuple[np.ndarray, OXform]] = {}
@@ -119,6 +124,9 @@ class AlembicArchive:
             self._set_shape(self._surface, surface.points, surface.corners, velocity, normals)
         if self._particles is not None:
             self._particles.set(self._recording.particles(number))
+        whitewater = self._recording.whitewater(number)
+        if self._whitewater is not None and whitewater is not None:
+            self._whitewater.set(whitewater)
         self._set_bodies(number)
         for motion, place in self._moving:
             pose = motion.pose(self._time.frame_time(number))
@@ -128,7 +136,8 @@ class AlembicArchive:
     def saved_as(self, suffix: str) -> Path:
         """Close the archive; return its file."""
         self._reserve.unlink()
-        self._surface = self._particles = self._top = self._archive = None
+        self._surface = self._particles = self._whitewater = None
+        self._top = self._archive = None
         self._moving, self._bodies, self._static = [], {}, []
         gc.collect()
         return self._file
@@ -136,7 +145,12 @@ class AlembicArchive:
     def _leak(self) -> None:
         """Keep all objects until the process ends, since closing would abort it."""
         places = [place for _, place in (*self._moving, *self._bodies.values())]
-        points = () if self._particles is None else self._particles.objects
+        points = [
+            one
+            for of in (self._particles, self._whitewater)
+            if of is not None
+            for one in of.objects
+        ]
         objects = (self._surface, *points, self._top, self._archive)
         for one in (*objects, *places, *self._static):
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(one))
