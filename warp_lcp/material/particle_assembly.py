@@ -577,7 +577,12 @@ def make_reseeding(
 
 
 def make_density_correction(
-    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, most: float | None = None
+    scene: ParticleScene,
+    grid: StaggeredGrid,
+    boundary: Boundary,
+    *,
+    most: float | None = None,
+    fills_layer: bool = False,
 ) -> DensityCorrection:
     """Return the density correction of a scene.
 
@@ -586,6 +591,7 @@ def make_density_correction(
         grid: its grid.
         boundary: its solids.
         most: largest density of a cell, relative to rest; None: that of the scene.
+        fills_layer: see `DensityCorrection`.
 
     Raises:
         ValueError: the scene has none.
@@ -603,6 +609,7 @@ def make_density_correction(
         every=settings.every,
         gain=scene.correction_gain,
         even=scene.keeps_volume,
+        fills_layer=fills_layer,
         tolerance=settings.tolerance,
     )
 
