@@ -26,7 +26,6 @@ from warp_lcp.kernels.launch_graph import LaunchGraph, copy, launch
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.boundary_kernels import RELEASED
-from warp_lcp.material.surface_layer_kernels import filled_kernel, layer_kernel
 from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 from warp_lcp.problem.method_protocol import Solver
 from warp_lcp.problem.stopping import MeanCriteria
@@ -241,8 +240,7 @@ class DensityCorrection:
     half full: inside a liquid that keeps its volume. The equation moves the excess over rho_max, or
     the deficit below 2 - rho_max, to or from the surface, and leaves the density of other cells
     unchanged; x may have either sign. Without `even` the voids that a flow creates are not closed,
-    every cell is truncated at rho_max from above alone, and the liquid grows: a thin pool by 5 %.
-    With `fills_layer` the layer of cells below the surface has equations of this kind, too. A
+    every cell is truncated at rho_max from above alone, and the liquid grows: a thin pool by 5 %. A
     wall that separates has a surface as well, and nothing is drawn to it.
 
     The operator, the method and its hierarchy are the pressure's. Where solids cut cells, pockets
@@ -264,8 +262,6 @@ class DensityCorrection:
         gain: factor of what a cell holds too much, >= 1: a kernel spreads what a single cell gives
             away, so that its density falls by less than the problem says.
         even: whether cells inside the material are to hold neither too much nor too little.
-        fills_layer: whether the layer of cells below the surface is to hold no less than liquid at
-            rest, see `warp_lcp.material.surface_layer_kernels`; with `even`.
         every: steps from one correction to the next.
         tolerance: relative residual at which a solve is done.
         max_iterations: limit of iterations of the method; the best iterate is taken then.
@@ -286,7 +282,6 @@ class DensityCorrection:
         max_density: float,
         gain: float = 1.0,
         even: bool = False,
-        fills_layer: bool = False,
         every: int = 1,
         tolerance: float = 1e-2,
         max_iterations: int = 20,
@@ -316,8 +311,6 @@ class DensityCorrection:
             )
             self._own_side = grid.field(wp.uint8) if grid.barriers is not None else None
             self._lower = grid.field(wp.float64)
-        # Cells that hold enough for a neighbor to be in the layer below the surface.
-        self._filled = wp.clone(self._inside) if self._inside is not None and fills_layer else None
         self._shift = (
             wp.full(grid.shape, SHIFT, dtype=wp.float32, device=grid.device)
             if boundary.open or even
@@ -464,7 +457,6 @@ class DensityCorrection:
                 planes=planes,
                 lower=self._lower,
             )
-            self._fill_layer()
             if self._counted is not None:
                 launch(
                     add_kernel,
@@ -472,20 +464,6 @@ class DensityCorrection:
                     [self._over.on_device(), self._lacking.on_device(), self._counted],
                     device=self.grid.device,
                 )
-
-    def _fill_layer(self) -> None:
-        """Launch the equations of the layer of cells below the surface, if they are asked for."""
-        if self._filled is None:
-            return
-        base, capacity, planes = self.boundary.base, self.boundary.capacity, self.grid.planes
-        marks = [base, self.density, capacity, self._filled]
-        self._solved.launch(filled_kernel, marks)
-        self.grid.part.fill(self._filled)
-        self._wrap(self._filled)
-        if self.grid.barriers is not None:
-            self.grid.barriers.surround(self._solved, self._filled, self._own_side)
-        fields = [self._kind, self.density, capacity, self._filled, self._own_side]
-        self._solved.launch(layer_kernel, [planes, *fields, self._b, self._lower])
 
     def _count_wrong_cells(self) -> tuple[int, float]:
         """Count the cells that are overfull or lack material deep inside; collective.

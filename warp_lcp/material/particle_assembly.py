@@ -577,12 +577,7 @@ def make_reseeding(
 
 
 def make_density_correction(
-    scene: ParticleScene,
-    grid: StaggeredGrid,
-    boundary: Boundary,
-    *,
-    most: float | None = None,
-    fills_layer: bool = False,
+    scene: ParticleScene, grid: StaggeredGrid, boundary: Boundary, *, most: float | None = None
 ) -> DensityCorrection:
     """Return the density correction of a scene.
 
@@ -591,7 +586,6 @@ def make_density_correction(
         grid: its grid.
         boundary: its solids.
         most: largest density of a cell, relative to rest; None: that of the scene.
-        fills_layer: see `DensityCorrection`.
 
     Raises:
         ValueError: the scene has none.
@@ -609,7 +603,6 @@ def make_density_correction(
         every=settings.every,
         gain=scene.correction_gain,
         even=scene.keeps_volume,
-        fills_layer=fills_layer,
         tolerance=settings.tolerance,
     )
 

@@ -50,8 +50,7 @@ class ParticleRedistribution:
     Walls that turn leave gaps: particles go straight on within a step, and along a wall at distance
     h from the center of its rotation, at omega [1/s], they depart from it by about omega^2 h dt^2 /
     2. The density there falls, so that nothing is in excess. Where thin solids are driven, each
-    step therefore corrects all of the density, to 1 +- (`MOST_THIN` - 1), and that of the layer of
-    cells below the surface, which would become sparse.
+    step therefore corrects all of the density, to 1 +- (`MOST_THIN` - 1).
 
     Args:
         scene: the scene, with its settings.
@@ -268,6 +267,4 @@ class ParticleRedistribution:
 
     def _make_correction(self) -> DensityCorrection:
         most = MOST_THIN if self._always else None
-        return make_density_correction(
-            self._scene, self._grid, self._boundary, most=most, fills_layer=self._always
-        )
+        return make_density_correction(self._scene, self._grid, self._boundary, most=most)
