@@ -182,6 +182,14 @@ class SandSolids:
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
         self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._setting = LaunchGraph(grid.device, self._launch_velocity)
+        # Middles of the solids, whose images along periodic axes have their velocity; lengths of
+        # these axes.
+        self._middle: wp.array | None = None
+        self._length = wp.vec3()
+        if boundary.moves and boundary.sides is not None:
+            self._middle = wp.zeros(1 + len(placed), dtype=wp.vec3, device=grid.device)
+            endless = [axis in boundary.sides.endless for axis in range(3)]
+            self._length = wp.vec3(*np.where(endless, grid.extent, 0.0))
         self._cells: np.ndarray | None = None  # `index` for which `walls` was built
         fits = (
             cuts
@@ -289,10 +297,30 @@ class SandSolids:
         """Compute the solids' velocities in the step from `time` [s] of length `dt` [s]."""
         self._boundary.begin_step(time, dt)
         if self.velocity:
+            if self._middle is not None:
+                self._middle.assign(self._middles(time))
             self._setting.run()
             if self.moves and self.grid.part.joined:
                 # Periodic axes: the values come from the opposite side.
                 self.grid.part.fill(*self.velocity)
+
+    def _middles(self, time: float) -> np.ndarray:
+        """Return the middles of the boxes around the solids at a time [s], shape (1 + solids, 3).
+
+        The domain's, and those of unbounded solids, are 0 [m]; so is z in 2-D.
+        """
+        axes = slice(self.grid.dimension)
+        middles = np.zeros((1 + len(self._placed), 3), dtype=np.float32)
+        for number, solid in enumerate(self._placed, start=1):
+            box = solid.geometry.bounds()
+            if box is not None and np.isfinite(box[:, axes]).all():
+                middle = np.zeros(3)
+                middle[axes] = np.mean(box[:, axes], axis=0)
+                if solid.motion is not None:
+                    pose = solid.motion.pose(time)
+                    middle = pose.rotation @ middle + pose.translation
+                middles[number] = middle
+        return middles
 
     def _launch_velocity(self) -> None:
         """Launch the update of the velocity of the solids' faces."""
@@ -308,6 +336,8 @@ class SandSolids:
                     self.index,
                     cut.turn,
                     cut.shift,
+                    self._middle,
+                    self._length,
                     field,
                 ]
                 grid.everywhere.launch(kernels.wall_velocity_kernel, inputs)

@@ -60,6 +60,8 @@ class Outcome:
         particles: how many there are.
         passed: the most that were outside of their room.
         volume: the log's volume, mean of the second half of the steps.
+        airborne: volume of particles far from the surface, which the log's volume leaves out,
+            likewise.
         crowded: volume that is missing because cells hold more than `CROWDED`, likewise.
         most_crowded: the most of it after a step.
         steps: their number.
@@ -69,6 +71,7 @@ class Outcome:
     particles: int
     passed: int
     volume: float
+    airborne: float
     crowded: float
     most_crowded: float
     steps: int
@@ -242,6 +245,26 @@ def inside(x: np.ndarray, room: Room, slack: float) -> np.ndarray:
     return np.asarray(((x > room[0] - slack) & (x < room[1] + slack)).all(axis=1))
 
 
+def in_the_air(simulation: Any, x: np.ndarray) -> int:
+    """Return how many particles had no cell of liquid next to their own cell.
+
+    Args:
+        simulation: after a step; its surface is that at the start of the step.
+        x: places of the particles at the start of the step [m], shape (n, 3).
+    """
+    phi = simulation.surface.level_set.phi.numpy()
+    grid = simulation.grid
+    if grid.dimension == 2:
+        phi = phi[1:2]
+    # The lowest level of a cell and its neighbors; cells beyond a thin wall are empty here.
+    for axis in range(3 - grid.dimension, 3):
+        phi = np.minimum(phi, np.minimum(np.roll(phi, 1, axis), np.roll(phi, -1, axis)))
+    i, j, k = (np.floor(x / grid.spacing).astype(int) + 1 - np.array(grid.origin)).T
+    if grid.dimension == 2:
+        k = np.zeros_like(k)
+    return int(np.count_nonzero(phi[k, j, i] > 0.0))
+
+
 def run(draw: Draw) -> Outcome:
     """Simulate a draw."""
     simulation = made(draw.tables)
@@ -254,9 +277,10 @@ def run(draw: Draw) -> Outcome:
         return draw.frame(x, simulation)
 
     start = [int(inside(places(), room, SLACK * dx).sum()) for room in draw.rooms(0.0)]
-    volumes, crowded, passed, spent = [], [], 0, 0.0
+    volumes, crowded, flying, passed, spent = [], [], [], 0, 0.0
     while simulation.time < draw.until - 1e-12:
         dt = min(simulation.stable_dt(), 0.02, draw.until - simulation.time)
+        began_at = simulation.particles.position.numpy().astype(np.float64)
         begun = time.process_time()
         for retry in range(RETRIES + 1):
             try:
@@ -272,12 +296,14 @@ def run(draw: Draw) -> Outcome:
             passed = max(passed, abs(int(here.sum()) - number)) if draw.tight else 0
             missing += excess(x[here], room, dx, each)
         volumes.append(row["volume"] / (count * each))
+        flying.append(in_the_air(simulation, began_at) / count)
         crowded.append(missing / (count * each))
     half = len(volumes) // 2
     return Outcome(
         count,
         passed,
         float(np.mean(volumes[half:])),
+        float(np.mean(flying[half:])),
         float(np.mean(crowded[half:])),
         float(np.max(crowded)),
         len(volumes),
@@ -300,8 +326,9 @@ def main() -> None:
                 out = run(draw)
                 print(
                     f"{number} {dimension}-D {draw.label}: {out.passed} of {out.particles} passed, "
-                    f"volume {out.volume:.3f}, crowded {out.crowded:.4f} (most "
-                    f"{out.most_crowded:.3f}), {out.steps} steps, {out.seconds:.2f} s",
+                    f"volume {out.volume:.3f} and {out.airborne:.3f} in the air, crowded "
+                    f"{out.crowded:.4f} (most {out.most_crowded:.3f}), {out.steps} steps, "
+                    f"{out.seconds:.2f} s",
                     flush=True,
                 )
 

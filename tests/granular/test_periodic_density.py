@@ -145,9 +145,11 @@ def test_the_problem_continues_at_the_opposite_side(solid: list[dict[str, Any]])
     np.testing.assert_allclose(corrected.x.numpy()[inner], expected, atol=0.01 if solid else 2e-4)
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_a_shifted_start_gives_shifted_displacements(dimension: int) -> None:
-    simulation = simulation_of((10, 8, 6)[:dimension])
+@pytest.mark.parametrize(("dimension", "solid"), [(2, []), (3, []), (2, [FLOOR])])
+def test_a_shifted_start_gives_shifted_displacements(
+    dimension: int, solid: list[dict[str, Any]]
+) -> None:
+    simulation = simulation_of((10, 8, 6)[:dimension], solid)
     size, ways = 10 * DX, []
     for shift in (0, 3, 5):
         points = squeezed(shift, dimension)

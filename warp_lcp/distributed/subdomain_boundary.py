@@ -60,9 +60,10 @@ def boundary_of_part(
             held=crossing.numbers if crossing is not None else (),
             wall_separating=separating,
             remarks=False,
+            repeated_sides=with_periodic(0, sides),
         )
         if thin is not None or ranks.any(not cut.whole_cells):
-            barriers = Barriers(grid, crossing, cut) if crossing is not None else None
+            barriers = Barriers(grid, crossing, cut, sides) if crossing is not None else None
             grid.divide(barriers)
             boundary: Boundary = CutBoundary(grid, cut, sides=sides, thin=thin, barriers=barriers)
             _check_open(part, boundary)

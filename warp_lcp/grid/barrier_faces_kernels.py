@@ -46,6 +46,7 @@ WHOLE = "warp_lcp.grid.barriers.whole"
 WIDEST = wp.constant(1.0)  # cells from a face's center up to which its open part may reach
 HALVINGS = 10  # halvings of the interval that the end of a face's open part lies in
 LEAST_OPEN = 0.02  # least open fraction of a crossed face
+TIE = wp.constant(1.0e-3)  # cells by which distances of two cells to a solid may differ by rounding
 STEPS = wp.constant(12)  # steps along a ray, in the integral of a cell's density kernel
 
 _AIR, _SOLID = wp.constant(wp.int8(AIR)), wp.constant(wp.int8(SOLID))
@@ -589,10 +590,13 @@ def wall_velocity_kernel(
 
 @cell_kernel(WHOLE, ordered=True)
 def whole_kernel(k, j, i, axis: int, number: I16, below: F32, above: F32, index: I32):
-    """Assign the open cell nearer to a crossing solid to that solid."""
+    """Assign the open cell nearer to a crossing solid to that solid.
+
+    Of two cells at about the same distance it is the upper one, at every place of the grid.
+    """
     if number[k, j, i] > wp.int16(0):
         c, b, a = cell_below(axis, k, j, i)
-        if above[k, j, i] <= below[k, j, i]:
+        if above[k, j, i] <= below[k, j, i] + TIE:
             c = k
             b = j
             a = i

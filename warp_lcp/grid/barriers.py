@@ -26,6 +26,7 @@ from warp_lcp.grid.barrier_geometry import CENTERS, REACH, Barrier
 from warp_lcp.grid.barrier_volume import filled_kernel
 from warp_lcp.grid.cell_kernel import POINTS, launch_list, list_kernel
 from warp_lcp.grid.cut_cells import CutCells
+from warp_lcp.grid.domain_sides import PeriodicSides
 from warp_lcp.grid.motion import RigidMotion
 from warp_lcp.grid.particle_loops import MARGIN
 from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
@@ -61,6 +62,7 @@ class Barriers:
         grid: the grid.
         walls: the solids.
         cut: cut cells of the other solids; it has the velocities of all solids.
+        sides: periodic sides; None if there are none.
 
     Attributes:
         near: uint8, not 0 in cells near one of the solids: 1, INSIDE if their center is in a mesh.
@@ -77,8 +79,14 @@ class Barriers:
             taken from one cell to another.
     """
 
-    def __init__(self, grid: StaggeredGrid, walls: ThinWalls, cut: CutCells) -> None:
-        self.grid, self.walls, self.cut = grid, walls, cut
+    def __init__(
+        self,
+        grid: StaggeredGrid,
+        walls: ThinWalls,
+        cut: CutCells,
+        sides: PeriodicSides | None = None,
+    ) -> None:
+        self.grid, self.walls, self.cut, self._periodic = grid, walls, cut, sides
         self.near = grid.field(wp.uint8)
         self.apart = [grid.field(wp.uint8) for _ in range(grid.dimension + 1)]
         self.number, self._share, self._scratch = grid.faces(wp.int16), grid.field(), grid.faces()
@@ -124,6 +132,7 @@ class Barriers:
         if self.walls.has_meshes:
             self._all.launch(faces_kernels.inside_kernel, [barrier, self.near])
         self._all.launch(faces_kernels.apart_kernel, [barrier, CENTERS, self.apart[-1]])
+        self._wrap(self.near, self.apart[-1])
         rays = RAYS[grid.dimension]
         self._all.launch(faces_kernels.ray_share_kernel, [barrier, rays, self._share])
 
@@ -154,9 +163,14 @@ class Barriers:
                 faces_kernels.cross_kernel,
                 [barrier, axis, self.apart[-1], cut.distance, open_, wall, number, *gaps],
             )
+        # Rounding must not make the two copies of a face differ: the solid would be lost where each
+        # of the two gives the other's cell to it (`enter`).
+        self._wrap(*self.number, *self.below, *self.above, *cut.open, *cut.wall)
         self._find_edges()
+        self._wrap(*cut.open, *self.sight)
         for axis, apart in enumerate(self.apart[:-1]):
             self._all.launch(faces_kernels.apart_kernel, [barrier, axis, apart])
+            self._wrap(apart)
         inner = self._all.common(self.grid.domain)
         if inner is not None:
             inner.launch(
@@ -168,6 +182,11 @@ class Barriers:
                 faces_kernels.capacity_kernel,
                 [self._share, bool(self.walls.in_parts), cut.capacity],
             )
+
+    def _wrap(self, *fields: wp.array) -> None:
+        """Fill the ring of fields beyond periodic sides, if there are any."""
+        if self._periodic is not None:
+            self._periodic.wrap(*fields)
 
     def _find_edges(self) -> None:
         """Find the open fractions of faces in which thin solids end."""

@@ -59,6 +59,8 @@ class CutCells:
         held: numbers of solids that may be thinner than cells without a note.
         open_sides: bits of `warp_lcp.grid.domain_sides.side_bits`: there the faces are open as far
             as no solid closes them, and the ring is air.
+        repeated_sides: bits of the sides of periodic axes, whose faces are open likewise; the ring
+            there has no state of its own.
 
     Attributes:
         distance: float32 signed distance to the nearest solid at nodes [cells], positive in the
@@ -67,7 +69,7 @@ class CutCells:
         nearest: the solids' two nearest to each node, see `NodeDistances`: owner, next_near,
             next_owner; empty when no solid moves.
         open: float32 open fraction of each face, a list of one field a component: 0, or in [1e-3,
-            1]; 0 on the domain's faces and outside.
+            1]; 0 on the domain's faces and outside, except at open and repeated sides.
         wall: int16 number of the solid that closes a face, the nearest to its center: -1 on open
             faces, 0 on the domain's.
         base: int8, SOLID where all faces of a cell are closed, else AIR; the ring is SOLID.
@@ -102,6 +104,7 @@ class CutCells:
         remarks: bool = True,
         left_out: Collection[int] = (),
         held: Collection[int] = (),
+        repeated_sides: int = 0,
     ) -> None:
         self.grid, self.solids, self.open_sides, self._left_out = (
             grid,
@@ -109,6 +112,7 @@ class CutCells:
             open_sides,
             frozenset(left_out),
         )
+        self._sides_with_faces = open_sides | repeated_sides
         self.moves = any(solid.motion is not None for solid in solids)
         # Differences of distances between the sides of each periodic axis that is cut [cells].
         self._differences: dict[int, float] = {}
@@ -437,7 +441,8 @@ class CutCells:
     def _refresh(self) -> None:
         """Recompute all fields that follow from the distances at nodes [cells].
 
-        Open fractions of faces, from 0 to 1, come first, then those on open sides of the domain.
+        Open fractions of faces, from 0 to 1, come first, then those on the domain's sides that
+        material can cross.
         The states of cells follow from fractions, and the capacity from states and distances.
         """
         grid, nodes = self.grid, self._nodes
@@ -464,7 +469,7 @@ class CutCells:
             wz=wz,
         )
         for number in range(2 * grid.dimension):
-            if self.open_sides >> number & 1:
+            if self._sides_with_faces >> number & 1:
                 self._open_side(number >> 1, SIDES[number])
         grid.domain.run(
             kernels.STATES,
@@ -483,7 +488,7 @@ class CutCells:
             continue_beyond(grid, self.open_sides, self.capacity)
 
     def _open_side(self, axis: int, name: str) -> None:
-        """Fill the fractions of the faces on an open side of the domain.
+        """Fill the fractions of the faces on an open or a periodic side of the domain.
 
         Face i lies below cell i: the side has the index 1 at the lower end, n + 1 at the upper one.
         """

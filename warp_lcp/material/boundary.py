@@ -195,6 +195,7 @@ class WholeCells:
             )
             turn = wp.zeros(len(shift), dtype=wp.mat33, device=grid.device)
             walls = [grid.planes, grid.spacing, wp.vec3i(*grid.origin), solids.index, turn, shift]
+            walls += [None, wp.vec3()]
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
         self._room = clearance(grid, self.base)

@@ -86,11 +86,15 @@ def wall_velocity_kernel(
     index: I32,
     turn: wp.array(dtype=wp.mat33),
     shift: wp.array(dtype=wp.vec3),
+    middle: wp.array(dtype=wp.vec3),
+    length: wp.vec3,
     field: F32,
 ):
     """Set the velocity turn x + shift [m/s] of the wall on the faces that it closes.
 
-    Other faces of the component get 0.
+    Other faces of the component get 0. Along periodic axes, of `length` [m] (0 along others), a
+    face may belong to an image of the wall. Then x is the face's place at the wall itself, the one
+    nearest to the wall's `middle` [m]. Without periodic axes `middle` is None.
     """
     c, b, a = cell_below(axis, k, j, i)
     wall = wp.max(index[k, j, i], index[c, b, a])
@@ -101,7 +105,13 @@ def wall_velocity_kernel(
         z = float(0.0)
         if planes == 2:
             z = (float(k + origin[2]) - wp.where(axis == 2, 1.0, 0.5)) * spacing
-        v = turn[wall] * wp.vec3(x, y, z) + shift[wall]
+        place = wp.vec3(x, y, z)
+        if middle:
+            for d in range(3):
+                if length[d] > 0.0:
+                    images = wp.round((place[d] - middle[wall][d]) / length[d])
+                    place[d] = place[d] - images * length[d]
+        v = turn[wall] * place + shift[wall]
         u = v[axis]
     field[k, j, i] = u
 

@@ -188,10 +188,11 @@ def make_boundary(
             remarks=not covered,
             left_out=crossing.everywhere if crossing is not None else (),
             held=crossing.numbers if crossing is not None else (),
+            repeated_sides=side_bits(periodic_sides(scene.endless)),
         )
         # On other ranks solids may cut cells.
         if not cut.whole_cells or (covered and placed) or thin is not None:
-            barriers = Barriers(grid, crossing, cut) if crossing is not None else None
+            barriers = Barriers(grid, crossing, cut, around) if crossing is not None else None
             grid.divide(barriers)
             boundary = CutBoundary(grid, cut, sides=around, thin=thin, barriers=barriers)
             return boundary, (*cut.notes, *(barriers.notes() if barriers is not None else ()))
