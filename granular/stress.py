@@ -170,7 +170,7 @@ class Stress(wl.VariationalInequality):
         mean_stress: root mean square of the stresses in that residual [m/s].
         velocity_error: estimate of the root mean square error of the velocity under the stresses of
             that residual [m/s], see `take_residual`.
-        steps_taken: steps with momentum since `begin`.
+        steps_taken: steps of the method since `begin`.
     """
 
     def __init__(
