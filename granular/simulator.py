@@ -363,6 +363,7 @@ class SandSimulation(ParticleSimulation):
         self.stress.kick_dt = float(state["stress_dt"])
         self.packing.kind.assign(state["cells"])
         self.packing.fraction.assign(state["fraction"])
+        self.packing.forget_window()
         self.outcome.ratio.assign(state["yield_ratio"])
         self.grid.part.fill(self.stress.now)
         self.grid.part.fill(self.packing.kind, self.packing.fraction, self.outcome.ratio)
@@ -446,7 +447,7 @@ class SandSimulation(ParticleSimulation):
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
                 self.sources.impose_velocity(solids.velocity, [])
-            packing.update(self.density, self.velocity, dt, solids.velocity)
+            packing.update(self.density, self.velocity, dt, solids.velocity, window)
             self._begin_bodies(dt)
         if (
             self.grid.device.is_cuda
