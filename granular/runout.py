@@ -85,11 +85,7 @@ def select_kernel(
 
 @forward_kernel(module="granular.runout")
 def column_kernel(
-    fraction: F32,
-    low: wp.vec3i,
-    rows: int,
-    first: wp.vec2i,
-    columns: wp.array2d(dtype=wp.float32),
+    fraction: F32, low: wp.vec3i, rows: int, first: wp.vec2i, columns: wp.array2d(dtype=wp.float32)
 ):
     """Compute the depth of sand of each column along y [cells], summed from the floor up.
 

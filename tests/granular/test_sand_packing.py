@@ -256,7 +256,7 @@ def test_an_update_of_a_window_is_that_of_all_cells() -> None:
         density[solid == SOLID] = 0.0
         window = grid.window((i - 1, j - 1, 0), (i + 4, j + 3, 0), grow=3, shift=1)
         if step == 5:
-            near.fraction.fill_(0.7)
+            near.fraction.assign(np.where(solid == SOLID, 0.0, 0.7))
             near.forget_window()
         for packing, cells in ((near, window), (whole, None)):
             packing.update(wp.array(density, dtype=wp.float32), velocity, DT, (), cells)

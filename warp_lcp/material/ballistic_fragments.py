@@ -364,9 +364,7 @@ def _turning(sums: Sums, *momenta: np.ndarray) -> list[np.ndarray]:
         NARROW * np.maximum(sums[:, :1], 1.0),
         sums[:, 1:4] / np.maximum(sums[:, :1], 1.0),
     )
-    moments = (
-        sums[:, SECOND_MOMENTS].reshape(-1, 3, 3) - sums[:, 1:4, None] * center[:, None, :]
-    )
+    moments = sums[:, SECOND_MOMENTS].reshape(-1, 3, 3) - sums[:, 1:4, None] * center[:, None, :]
     trace = moments[:, 0, 0] + moments[:, 1, 1] + moments[:, 2, 2]
     values, axes = np.linalg.eigh(trace[:, None, None] * np.eye(3) - moments)
     inverse = (
