@@ -12,7 +12,7 @@ from warp_lcp.granular import packing_kernels as kernels
 from warp_lcp.granular.fields import SandFields
 from warp_lcp.grid.cell_kernel import launch_list
 from warp_lcp.grid.domain_sides import PeriodicSides
-from warp_lcp.grid.staggered import StaggeredGrid, Window, three_components
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, three_components
 from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, launch
 from warp_lcp.kernels.layout import put
 from warp_lcp.kernels.readback import DeviceScalar
@@ -113,6 +113,9 @@ class Packing:
         self._rows = wp.zeros((2, *grid.shape[:2]), dtype=wp.float64, device=grid.device)
         self._found = DeviceScalar(grid.device, 2)
         self._rate = Scalar()  # dx / dt [m/s]
+        # Cells and nodes of an update, and the window of the last one.
+        self._cells, self._nodes = ActiveWindow(grid.domain), ActiveWindow(self.nodes)
+        self._last: Window = grid.domain
         self._update = LaunchGraph(grid.device, self._launch)
         if sides is not None:  # the neighbors of a row may be at its other end
             self.spans.assign(np.full((*grid.shape[:2], 2), (low[2], high[2] + 1), dtype=np.int32))
@@ -123,8 +126,12 @@ class Packing:
         velocity: Sequence[wp.array],
         dt: float,
         solid: Sequence[wp.array] = (),
+        window: Window | None = None,
     ) -> None:
         """Update the packing from the particles' density and velocity.
+
+        Cells without sand, now and at the last update, keep their values, which nothing reads: at
+        most `drive` and `start` would change there.
 
         Args:
             density: density of the particles, relative to the densest packing, float32.
@@ -132,8 +139,10 @@ class Packing:
             dt: time step [s].
             solid: velocity of the solids on each component's faces [m/s]; empty if they are at
                 rest.
+            window: cells that hold all sand, with two to spare on each side; None for all cells.
         """
         self._rate.value = self.grid.spacing / dt
+        self._move_windows(None if solid else window)
         self._update.run(
             density,
             velocity,
@@ -141,6 +150,28 @@ class Packing:
             variant=tuple(field.ptr for field in (density, *velocity, *solid)),
         )
         self._found.changed()
+
+    def forget_window(self) -> None:
+        """Let the next update visit all cells, after fields were set from outside."""
+        self._last = self.grid.domain
+
+    def _move_windows(self, window: Window | None) -> None:
+        """Set the cells and nodes of an update: those of its window and of the last one.
+
+        All cells are visited on ranks, with periodic sides, and where sand fills the domain.
+        """
+        domain, nodes = self.grid.domain, self.nodes
+        alone = self.sides is None and not self.grid.part.shared
+        box = domain.common(Window(window.low, window.high, domain.device)) if window else None
+        if box is None or not alone:
+            box = domain
+        low = [min(pair) for pair in zip(box.low, self._last.low, strict=True)]
+        high = [max(pair) for pair in zip(box.high, self._last.high, strict=True)]
+        self._last = box
+        self._cells.move_to(Window.of(low, high, domain.device))
+        more = [n - d for n, d in zip(nodes.high, domain.high, strict=True)]
+        high = [h + m for h, m in zip(high, more, strict=True)]
+        self._nodes.move_to(Window.of(low, high, domain.device))
 
     def find_ghosts(self, layers: int) -> None:
         """Find the ghost cells with sand, for `join`; collective.
@@ -179,8 +210,8 @@ class Packing:
         volumes; masses of faces; fronts; weights of edges; stiffness of cells; spans of the rows.
         """
         grid, dimension = self.grid, self.grid.dimension
-        domain, nodes = grid.domain, self.nodes
-        domain.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])
+        cells, nodes = self._cells, self._nodes
+        cells.launch(kernels.fraction_kernel, [self.base, self._capacity, density, self.fraction])
         if self.sides is not None:
             self.sides.wrap(self.fraction)
         openings, volume, around = (
@@ -199,7 +230,7 @@ class Packing:
             self.flags,
             self.drive,
         ]
-        domain.launch(kernels.contents_kernel, inputs)
+        cells.launch(kernels.contents_kernel, inputs)
         if self.sides is not None:
             self.sides.wrap(self.flags, self.kind)
         for axis in range(dimension):
@@ -219,7 +250,7 @@ class Packing:
             put(kernels.Faces(), dict(zip("xyz", fields, strict=False)))
             for fields in (self.mass, self.start, self.inverse)
         )
-        domain.launch(
+        cells.launch(
             kernels.front_kernel, [dimension, self._rate, openings, mass, start, self.drive]
         )
         for (alpha, beta), part, share in zip(SHEARS[dimension], around, self.share, strict=False):
@@ -237,14 +268,14 @@ class Packing:
                 ],
             )
         shares = put(kernels.Faces(), dict(zip("xyz", self.share, strict=False)))
-        domain.launch(
+        cells.launch(
             kernels.stiffness_kernel, [dimension, self.flags, inverse, shares, openings, self.stiff]
         )
         self._launch_counts(density)
         if self.sides is not None:
             return  # the spans are whole rows
-        domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
-        nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
+        grid.domain.launch_rows(kernels.span_kernel, [self.flags, self._own])
+        self.nodes.launch_rows(kernels.widen_kernel, [self._own, self.spans])
 
     def _launch_counts(self, density: wp.array) -> None:
         """Launch the computation of `sand_cells` and `densest`."""

@@ -10,14 +10,13 @@ count the n-th number falls is the next one. Counts are integers, so that the re
 
 from typing import no_type_check
 
-import numpy as np
 import warp as wp
 
 from warp_lcp.grid.cell_kernel import F32, INTS, POINTS, launch_list, list_kernel
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels.compiler import forward_kernel
-from warp_lcp.kernels.launch_graph import LaunchGraph, clear, launch
+from warp_lcp.kernels.launch_graph import LaunchGraph, launch
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.recorded_arguments import Scalar
 
@@ -84,47 +83,35 @@ def select_kernel(
     out[axis] = wp.cast(wp.where(bits < SIGN, ~bits, bits ^ SIGN), wp.float32)
 
 
-def deposit_front(depth: np.ndarray) -> float:
-    """Return how far the connected deposit reaches along x [cells].
-
-    The deposit is the columns around the deepest one that hold at least `LEAST_DEPTH`. Its front is
-    where the depth, linear between the centers of columns, falls to that. Grains that have run
-    ahead do not count, nor does sand beyond a gap.
-
-    Args:
-        depth: densely packed sand of each column along x [cells], shape (n,).
-
-    >>> deposit_front(np.array([1.5, 1.0, 0.5, 0.0, 0.1, 1.2]))
-    2.5
-    """
-    if not len(depth) or depth.max() < LEAST_DEPTH:
-        return 0.0
-    depth = depth.astype(np.float32)  # as on the device
-    last = int(depth.argmax())
-    while last + 1 < len(depth) and depth[last + 1] >= LEAST_DEPTH:
-        last += 1
-    if last + 1 == len(depth):
-        return float(len(depth))
-    beyond = (depth[last] - np.float32(LEAST_DEPTH)) / (depth[last] - depth[last + 1])
-    return float(np.float32(last + 0.5) + beyond)
-
-
 @forward_kernel(module="granular.runout")
-def depth_kernel(fraction: F32, rows: int, depth: wp.array(dtype=wp.float32)):
-    """Compute the largest depth of sand at an x, over z [cells].
+def column_kernel(
+    fraction: F32, low: wp.vec3i, rows: int, first: wp.vec2i, columns: wp.array2d(dtype=wp.float32)
+):
+    """Compute the depth of sand of each column along y [cells], summed from the floor up.
 
-    With one thread per column; `rows` are the cells along y.
+    With one thread per column of this process. `low` is its first cell (k, j, i) in the stored
+    shape, `rows` the number of its cells along y, `first` the place (k, i) of its first column.
     """
     k, i = wp.tid()
     total = float(0.0)
     for j in range(rows):
-        total += fraction[k + 1, j + 1, i + 1]
-    wp.atomic_max(depth, i, total)
+        total += fraction[k + low[0], j + low[1], i + low[2]]
+    columns[k + first[0], i + first[1]] = total
+
+
+@forward_kernel(module="granular.runout")
+def depth_kernel(columns: wp.array2d(dtype=wp.float32), depth: wp.array(dtype=wp.float32)):
+    """Compute the largest depth of sand at an x, over z [cells]; with one thread per x."""
+    i = wp.tid()
+    deepest = float(0.0)
+    for k in range(columns.shape[0]):
+        deepest = wp.max(deepest, columns[k, i])
+    depth[i] = deepest
 
 
 @forward_kernel(module="granular.runout")
 def front_kernel(depth: wp.array(dtype=wp.float32), least: float, out: wp.array(dtype=wp.float32)):
-    """Compute the front as `deposit_front` does [cells]; with one thread."""
+    """Compute the front of the deposit, see `DepositFront` [cells]; with one thread."""
     count = depth.shape[0]
     last = int(0)
     for i in range(count):
@@ -141,34 +128,65 @@ def front_kernel(depth: wp.array(dtype=wp.float32), least: float, out: wp.array(
 
 
 class DepositFront:
-    """Front of the deposit on a grid, see `deposit_front`.
+    """How far the connected deposit reaches along x.
+
+    The deposit is the columns around the deepest one that hold at least `LEAST_DEPTH`. Its front is
+    where the depth, linear between the centers of columns, falls to that. Grains that have run
+    ahead do not count, nor does sand beyond a gap. In 3-D the depth at an x is that of the deepest
+    column there. On ranks all have the front of the whole domain.
 
     Args:
         grid: the grid.
     """
 
     def __init__(self, grid: StaggeredGrid) -> None:
-        self._grid = grid
-        self._depth = wp.zeros(grid.counts[0], dtype=wp.float32, device=grid.device)
+        self._grid, part = grid, grid.part
+        counts = grid.domain_counts if part.shared else grid.counts
+        # Cells of the domain before the first column.
+        self._before = (0, 0, 0) if part.shared else grid.origin
+        self._columns = wp.zeros((counts[2], counts[0]), dtype=wp.float32, device=grid.device)
+        self._depth = wp.zeros(counts[0], dtype=wp.float32, device=grid.device)
         self._reading = DeviceScalar(grid.device, 1, wp.float32)
-        self._search = LaunchGraph(grid.device, self._launch)
+        self._summing = LaunchGraph(grid.device, self._launch_columns)
+        self._search = LaunchGraph(grid.device, self._launch_search)
+        self._both = LaunchGraph(grid.device, self._launch_both)
 
     def find(self, fraction: wp.array) -> None:
-        """Launch the search in a field of cell fractions; `read` then returns the result."""
-        self._search.run(fraction)
+        """Launch the search in a field of cell fractions; `read` then returns the result.
+
+        Collective: ranks add up their parts of the columns.
+        """
+        if self._grid.part.shared:
+            self._columns.zero_()
+            self._summing.run(fraction)
+            self._columns.assign(self._grid.part.ranks.sum(self._columns.numpy()))
+            self._search.run()
+        else:
+            self._both.run(fraction)
         self._reading.changed()
 
-    def _launch(self, fraction: wp.array) -> None:
-        (nx, ny, nz), device = self._grid.counts, self._grid.device
-        clear(self._depth)
-        launch(depth_kernel, (nz, nx), [fraction, ny, self._depth], device=device)
+    def _launch_columns(self, fraction: wp.array) -> None:
+        part, device = self._grid.part, self._grid.device
+        low, high, (x, _, z) = part.owned.low, part.owned.high, part.first
+        depths, rows, width = (h - l for l, h in zip(low, high, strict=True))
+        first = wp.vec2i(z - self._before[2], x - self._before[0])
+        inputs = [fraction, wp.vec3i(*low), rows, first, self._columns]
+        launch(column_kernel, (depths, width), inputs, device=device)
+
+    def _launch_search(self) -> None:
+        device = self._grid.device
+        launch(depth_kernel, self._depth.shape, [self._columns, self._depth], device=device)
         inputs = [self._depth, LEAST_DEPTH, self._reading.array]
         launch(front_kernel, 1, inputs, device=device)
 
+    def _launch_both(self, fraction: wp.array) -> None:
+        self._launch_columns(fraction)
+        self._launch_search()
+
     def read(self) -> float:
-        """Return x of the front [m]; waits for the device."""
+        """Return x of the front [m], 0 without a deposit; waits for the device."""
         cells = float(self._reading.numpy()[0])
-        return self._grid.spacing * (self._grid.origin[0] + cells) if cells > 0.0 else 0.0
+        return self._grid.spacing * (self._before[0] + cells) if cells > 0.0 else 0.0
 
 
 class ParticlePercentiles:

@@ -171,7 +171,7 @@ class SandSolver(Table):
     velocity_tolerance: NonNegative | None = Field(
         default=None,
         description="a solve also ends where the estimated error of the velocities is at most this "
-        "[g dt]; default: 50 tolerance; 0: only the residual counts",
+        "[g dt]; default: 50 tolerance, 0 with interleaved-sweeps; 0: only the residual counts",
     )
     max_iterations: int = Field(
         default=600, ge=10, description="after these the step accepts the stresses"
@@ -183,8 +183,9 @@ class SandSolver(Table):
     @property
     def allowed_velocity_error(self) -> float:
         """Return the tolerance of the velocities [g dt], 0 if only the residual counts."""
-        given = self.velocity_tolerance
-        return VELOCITY_SHARE * self.tolerance if given is None else given
+        if self.velocity_tolerance is not None:
+            return self.velocity_tolerance
+        return 0.0 if self.method == "interleaved-sweeps" else VELOCITY_SHARE * self.tolerance
 
 
 class SandProperties(MaterialProperties):

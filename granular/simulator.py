@@ -15,7 +15,7 @@ import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
 from warp_lcp.granular.packing import Packing
 from warp_lcp.granular.report import SandReport
-from warp_lcp.granular.runout import DepositFront, ParticlePercentiles, deposit_front
+from warp_lcp.granular.runout import DepositFront, ParticlePercentiles
 from warp_lcp.granular.scene import SandScene
 from warp_lcp.granular.stress import Stress, YieldSet
 from warp_lcp.granular.stress_methods import METHODS, StressWorkspace
@@ -142,7 +142,7 @@ class SandSimulation(ParticleSimulation):
             self.packing, self.solids.walls, box=box, rate=rate, bodies=self.carried
         )
         self.outcome = SandReport(self.stress)
-        self._deposit = None if grid.part.shared else DepositFront(grid)
+        self._deposit = DepositFront(grid)
         self._work: StressWorkspace | None = None  # of the current method
         self._made_by: Solver | None = None
         inner = (slice(1, -1),) * 3
@@ -252,15 +252,14 @@ class SandSimulation(ParticleSimulation):
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.packing.flags, self.stress.now):
                 self.outcome.measure()
-                if self._deposit is not None:
-                    self._deposit.find(self.packing.fraction)
+                self._deposit.find(self.packing.fraction)
 
     def _measured(self) -> Row:
         """Return stress values that only the log needs."""
         if not self.scene.output.diagnostics:
             return {}
         report = self.outcome.report(self.scene.physics.density * self.grid.cell_volume)
-        return report | {"front": self._deposit_front()}
+        return report | {"front": self._deposit.read()}
 
     def _measure_front(self) -> None:
         """Launch the percentiles of runout and height, on CUDA."""
@@ -275,7 +274,7 @@ class SandSimulation(ParticleSimulation):
         mean square error, in units of g dt, see `Stress.take_residual`; solve_residual: relative to
         that at the start of the solve; staggering_iterations: iterations of the coupled method;
         yielded, dissipation, predicted_excess: see `SandReport.report`; front [m]: x up to which
-        the deposit is connected at the start of the step, see `deposit_front`; max_fraction:
+        the deposit is connected at the start of the step, see `DepositFront`; max_fraction:
         largest fraction of a cell at the start of the step, relative to the densest packing; runout
         [m]: 99th percentile of x less that at the start; height [m]: 99th percentile of y;
         flow_rate [kg/s; kg/(s m) in 2-D]: mass below the gauge, or without a gauge the mass that
@@ -364,6 +363,7 @@ class SandSimulation(ParticleSimulation):
         self.stress.kick_dt = float(state["stress_dt"])
         self.packing.kind.assign(state["cells"])
         self.packing.fraction.assign(state["fraction"])
+        self.packing.forget_window()
         self.outcome.ratio.assign(state["yield_ratio"])
         self.grid.part.fill(self.stress.now)
         self.grid.part.fill(self.packing.kind, self.packing.fraction, self.outcome.ratio)
@@ -447,7 +447,7 @@ class SandSimulation(ParticleSimulation):
             if self.sources is not None:
                 self.sources.supply(self.time + 0.5 * dt, self.velocity, self._base)
                 self.sources.impose_velocity(solids.velocity, [])
-            packing.update(self.density, self.velocity, dt, solids.velocity)
+            packing.update(self.density, self.velocity, dt, solids.velocity, window)
             self._begin_bodies(dt)
         if (
             self.grid.device.is_cuda
@@ -586,22 +586,6 @@ class SandSimulation(ParticleSimulation):
         return float(np.partition(position[:, 0], nth)[nth]), float(
             np.partition(position[:, 1], nth)[nth]
         )
-
-    def _deposit_front(self) -> float:
-        """Return x of the deposit's front [m]; collective.
-
-        In 3-D the depth at an x is that of the deepest column there.
-        """
-        if self._deposit is not None:
-            return self._deposit.read()
-        part, counts = self.grid.part, self.grid.domain_counts
-        owned = part.box_of(self.packing.fraction.numpy())
-        depth = np.zeros((counts[2], counts[0]), dtype=np.float32)
-        i, _, k = part.first
-        nz, _, nx = owned.shape
-        # Summed from the floor up in float32, as the kernel does.
-        depth[k : k + nz, i : i + nx] = np.cumsum(owned, axis=1, dtype=np.float32)[:, -1]
-        return self.grid.spacing * deposit_front(part.ranks.sum(depth).max(axis=0))
 
     def _front_of_all(self) -> tuple[float, float]:
         """Return the percentiles of all ranks' particles.

@@ -77,6 +77,8 @@ class StressDeviceIteration:
             number.value = float(value)
         self._make_loop()
         self._beginning.run()
+        if not stress.packing.grid.device.is_cuda and self._going.numpy()[0]:
+            stress.start_from_now()
         self._repeat()
 
     def resume(self) -> None:
@@ -130,8 +132,8 @@ class StressDeviceIteration:
             *self._scalars,
         ]
         launch(kernels.begin_steps_kernel, 1, [*fields, *arguments], device=device)
-        s.start_from_now()
         if device.is_cuda:
+            s.start_from_now()
             self._launch_steps()
 
     def _launch_resumption(self) -> None:

@@ -69,14 +69,27 @@ class StressWorkspace(WorkspaceDefaults):
         self.problem, self.x, self.residual = stress, stress.now, self
         self.norm, self.current = math.inf, False
         self.velocity_tolerance = 0.0
+        self._least, self._tolerance = 0, 0.0  # minimum of steps; tolerance of the residual [m/s]
 
     def evaluate(self, x: wp.array) -> float:
         """Return the norm of the natural residual of pressure and friction [m/s].
 
-        `stress.checked` is then the velocity under the stresses.
+        After the minimum of steps it is at most the tolerance if the estimated error of the
+        velocities is within its own. Before, that estimate means nothing: it is 0 at the start.
+        `Stress.last_residual` has the residual itself, `stress.checked` the velocity.
         """
-        self.norm, self.current = math.hypot(*self.problem.residual()), True
+        self._find_residual()
+        stress = self.problem
+        if (
+            stress.steps_taken >= max(self._least, 1)
+            and stress.velocity_error <= self.velocity_tolerance
+        ):
+            self.norm = min(self.norm, self._tolerance)
         return self.norm
+
+    def _find_residual(self) -> None:
+        """Compute the norm of the natural residual."""
+        self.norm, self.current = math.hypot(*self.problem.residual()), True
 
     def rounding_floor(self, x: wp.array, epsilon: float) -> float:
         """Return 0: the rounding floor of the residual of sand is unknown."""
@@ -194,7 +207,6 @@ class MomentumWorkspace(StressWorkspace):
         # Slot of the decisions with the residual of the current stresses; None if it is unknown.
         self._news: int | None = None
         self._steps_counted = 0  # steps that the outer loop has counted
-        self._least, self._tolerance = 0, 0.0
 
     def begin_on_device(
         self, guess: DeviceArray | None, criteria: wl.StoppingCriteria | MeanCriteria, steps: int
@@ -227,21 +239,12 @@ class MomentumWorkspace(StressWorkspace):
         self.norm, self.current = math.hypot(*self.problem.take_residual(*map(float, sums))), True
         return self.norm
 
-    def evaluate(self, x: wp.array) -> float:
-        """Return the norm of the natural residual; see the base class.
-
-        After the minimum of steps it is at most the tolerance if the estimated error of the
-        velocities is within its own. Before, that estimate means nothing: it is 0 at the start.
-        `Stress.last_residual` has the residual itself.
-        """
-        norm = super().evaluate(x) if self._news is None else self._read_residual(self._news)
-        stress = self.problem
-        if (
-            stress.steps_taken >= max(self._least, 1)
-            and stress.velocity_error <= self.velocity_tolerance
-        ):
-            self.norm = norm = min(norm, self._tolerance)
-        return norm
+    def _find_residual(self) -> None:
+        """Compute the norm of the natural residual, or read that of the device."""
+        if self._news is None:
+            super()._find_residual()
+        else:
+            self._read_residual(self._news)
 
     @property
     def _early(self) -> float:
@@ -358,6 +361,7 @@ class InterleavedSweeps(Settings):
         """Sweep `check_every` times over pressure and friction."""
         for _ in range(self.check_every):
             self._round(problem)
+        problem.steps_taken += self.check_every
         return wl.Step(
             "round", self.check_every, interim=True, iterations=self.check_every, final=True
         )
@@ -386,6 +390,7 @@ class StressSweepWorkspace(StressWorkspace):
 
     def start(self, *, warm: bool, tolerance: float) -> None:
         """Compute the velocity that the sweeps then update."""
+        self._tolerance = tolerance
         self.problem.velocity.find(self.problem.now)
 
 

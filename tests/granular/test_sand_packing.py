@@ -234,3 +234,43 @@ def test_cells_of_sand_and_the_densest_are_those_that_numpy_finds_in_every_step(
         assert packing.densest == (density.numpy()[seen] / capacity[seen]).max(initial=0.0)
         held, active = np.flatnonzero(flags.ravel()[walls.cells.numpy()]), walls.active.numpy()
         np.testing.assert_array_equal(active[: 1 + len(held)], [len(held), *held])
+
+
+def test_an_update_of_a_window_is_that_of_all_cells() -> None:
+    """Sand that moves through the grid, packed in the cells around it and in all cells.
+
+    Cells that the sand has left lose it, also after fields were set from outside.
+    """
+    grid = StaggeredGrid((24, 20, 1), DX, 2)
+    base, one = grid.field(wp.int8), wp.full(grid.shape, 1.0, dtype=wp.float32, device=grid.device)
+    solid = np.full(grid.shape, SOLID, dtype=np.int8)
+    solid[1:-1, 1:-1, 1:-1] = 0
+    solid[1, 4, 5:9] = SOLID
+    base.assign(solid)
+    near, whole = Packing(grid, base, one), Packing(grid, base, one)
+    velocity = [wp.full(grid.shape, 2.0, dtype=wp.float32, device=grid.device) for _ in range(2)]
+    rng = np.random.default_rng(19)
+    for step, (j, i) in enumerate([(8, 8), (7, 8), (6, 9), (4, 10), (1, 1), (12, 16)]):
+        density = np.zeros(grid.shape, dtype=np.float32)
+        density[1, j : j + 5, i : i + 6] = rng.uniform(0.0, 1.3, (5, 6))
+        density[solid == SOLID] = 0.0
+        window = grid.window((i - 1, j - 1, 0), (i + 4, j + 3, 0), grow=3, shift=1)
+        if step == 5:
+            near.fraction.assign(np.where(solid == SOLID, 0.0, 0.7))
+            near.forget_window()
+        for packing, cells in ((near, window), (whole, None)):
+            packing.update(wp.array(density, dtype=wp.float32), velocity, DT, (), cells)
+        names = ("fraction", "kind", "flags", "stiff", "spans")
+        fields = [(getattr(near, name), getattr(whole, name)) for name in names]
+        fields += [
+            *zip(
+                [*near.mass, *near.inverse, *near.share],
+                [*whole.mass, *whole.inverse, *whole.share],
+                strict=True,
+            )
+        ]
+        for a, b in fields:
+            np.testing.assert_array_equal(a.numpy(), b.numpy())
+        sand = whole.flags.numpy() != 0
+        np.testing.assert_array_equal(near.drive.numpy()[sand], whole.drive.numpy()[sand])
+        assert near.sand_cells == whole.sand_cells > 0

@@ -281,7 +281,7 @@ def test_angles_of_friction_that_grows_are_those_of_layers() -> None:
 def test_velocities_have_a_tolerance_that_follows_from_that_of_the_residual() -> None:
     sand = [box([0.0, 0.0], [0.5, 0.25])]
 
-    def allowed(**solver: float) -> float:
+    def allowed(**solver: object) -> float:
         model = scene(size=[1.0, 0.5], resolution=16, sand=sand, solver=solver)
         return model.solver.allowed_velocity_error
 
@@ -289,3 +289,5 @@ def test_velocities_have_a_tolerance_that_follows_from_that_of_the_residual() ->
     assert allowed(tolerance=1e-4) == pytest.approx(0.005)
     assert allowed(velocity_tolerance=0.02) == 0.02
     assert allowed(velocity_tolerance=0.0) == 0.0
+    assert allowed(method="interleaved-sweeps") == 0.0
+    assert allowed(method="interleaved-sweeps", velocity_tolerance=0.02) == 0.02

@@ -57,7 +57,8 @@ def test_the_velocity_error_is_near_its_estimate(dimension: int) -> None:
     assert max(ratios) <= RANGE[1]
 
 
-def test_a_solve_ends_where_velocities_are_within_their_tolerance() -> None:
+@pytest.mark.parametrize("method", ["accelerated-projection", "interleaved-sweeps"])
+def test_a_solve_ends_where_velocities_are_within_their_tolerance(method: str) -> None:
     """Status of a solve by its velocities.
 
     Without a tolerance of the velocities some of these steps take more iterations. With one the
@@ -65,7 +66,8 @@ def test_a_solve_ends_where_velocities_are_within_their_tolerance() -> None:
     """
     counts = []
     for velocity_tolerance in (0.0, 0.05):
-        simulation = column(solver={"velocity_tolerance": velocity_tolerance, "tolerance": 2e-4})
+        solver = {"velocity_tolerance": velocity_tolerance, "tolerance": 2e-4, "method": method}
+        simulation = column(solver=solver)
         total = 0
         for _ in range(30):
             row = simulation.step(min(simulation.stable_dt(), 5e-3))

@@ -27,6 +27,8 @@ from warp_lcp.material.boundary import Boundary
 NARROW = 1.0
 ROOM, LEAST = 2, 64  # allocated bodies: a factor on their number, and a minimum
 VECTORS = 5  # vectors of a body that kernels read
+# Columns of the matrix xx, xy, xz; xy, yy, yz; xz, yz, zz among a body's sums.
+SECOND_MOMENTS = [10, 13, 14, 13, 11, 15, 14, 15, 12]
 Sums = np.ndarray  # results of `kernels.add_up`, float64, shape (bodies, COLUMNS)
 NOTHING: Sums = np.zeros((0, kernels.COLUMNS))
 
@@ -337,8 +339,9 @@ class BallisticFragments:
 
 def _about_center(sums: Sums) -> np.ndarray:
     """Return the angular momenta of bodies about their centers, shape (bodies, 3)."""
-    orbital = np.cross(sums[:, 1:4], sums[:, 4:7]) / np.maximum(sums[:, :1], 1.0)
-    momenta: np.ndarray = sums[:, 7:10] - orbital
+    x, y, z, u, v, w = sums[:, 1:7].T
+    orbital = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+    momenta: np.ndarray = sums[:, 7:10] - orbital / np.maximum(sums[:, :1], 1.0)
     return momenta
 
 
@@ -361,14 +364,9 @@ def _turning(sums: Sums, *momenta: np.ndarray) -> list[np.ndarray]:
         NARROW * np.maximum(sums[:, :1], 1.0),
         sums[:, 1:4] / np.maximum(sums[:, :1], 1.0),
     )
-    xx, yy, zz, xy, xz, yz = sums[:, 10:16].T
-    moments = (
-        np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
-        - sums[:, 1:4, None] * center[:, None, :]
-    )
-    values, axes = np.linalg.eigh(
-        np.trace(moments, axis1=1, axis2=2)[:, None, None] * np.eye(3) - moments
-    )
+    moments = sums[:, SECOND_MOMENTS].reshape(-1, 3, 3) - sums[:, 1:4, None] * center[:, None, :]
+    trace = moments[:, 0, 0] + moments[:, 1, 1] + moments[:, 2, 2]
+    values, axes = np.linalg.eigh(trace[:, None, None] * np.eye(3) - moments)
     inverse = (
         axes * np.where(values > least, 1.0 / np.maximum(values, least), 0.0)[:, None, :]
     ) @ axes.swapaxes(1, 2)

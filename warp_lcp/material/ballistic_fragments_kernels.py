@@ -210,11 +210,11 @@ def fly_kernel(
     mean = motion[b, 0]
     spin = motion[b, 1]
     k1 = velocity_at(u, v, w, flight.planes, flight.origin, x0)
-    k2 = velocity_at(u, v, w, flight.planes, flight.origin, x0 + 0.5 * h * (k1 - mean))
-    k3 = velocity_at(u, v, w, flight.planes, flight.origin, x0 + 0.75 * h * (k2 - mean))
-    way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
-    if flight.straight:
-        way = h * k1
+    way = h * k1
+    if flight.straight == 0:
+        k2 = velocity_at(u, v, w, flight.planes, flight.origin, x0 + 0.5 * h * (k1 - mean))
+        k3 = velocity_at(u, v, w, flight.planes, flight.origin, x0 + 0.75 * h * (k2 - mean))
+        way = h / 9.0 * (2.0 * k1 + 3.0 * k2 + 4.0 * k3)
     x1 = x0 + way
     end[i] = start[i] + way / flight.inverse_dx
     rigid = wp.cross(spin, start[i] - motion[b, 2])
