@@ -138,9 +138,8 @@ class StokesPreconditioner:
             square += bodies.square(z_bodies, r_bodies - z_bodies)
         return math.sqrt(max(square, 0.0))
 
-    def estimate(self) -> float:
-        """Write z = P r; return an estimate of the error, the energy norm of z."""
-        self.apply()
+    def error(self) -> float:
+        """Return an estimate of the error after `apply`, the energy norm of z."""
         square = 0.0 if self.operator.bodies is None else self._square_of_bodies
         square += self._squares.read()[0]
         square += self._pressure_square.read()[0]
