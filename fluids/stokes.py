@@ -48,6 +48,8 @@ USEFUL = 0.5
 # Steps begin with the last one until the estimated splitting error is below this share of its
 # tolerance. They do not alternate where the estimate is somewhat below the bound.
 CONTINUES = 0.75
+# Steps from the last one between two estimates of the splitting error.
+ESTIMATES = 4
 # Error of the last step as a start, relative to |u|_A, above which the split step is solved.
 FARTHEST = 1.0
 
@@ -151,6 +153,7 @@ class StokesSolve:
         )
         self._krylov: FlexibleGMRES | None = None  # built, with its vectors, at the first use
         self._size = 0.0  # |u|_A of the last residual
+        self._share, self._steps_to_estimate = 0.0, 0  # the last estimate, see `couple_from_last`
         self.continues = False
         self._last = grid.faces()  # velocity at the end of the last coupled step
         self._last_pressure, self._last_cells = grid.field(wp.float64), grid.field(wp.int8)
@@ -208,7 +211,7 @@ class StokesSolve:
         if self.unsupported or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
         result = self.couple(velocity, share, moved)
-        self.continues = result.used
+        self.continues, self._share, self._steps_to_estimate = result.used, share, 0
         return result
 
     def _launch_estimation(
@@ -283,8 +286,9 @@ class StokesSolve:
 
         With x1 the pressure of the first projection, A (u - u2) = D'(x - x1) up to walls. One
         viscous cycle estimates |u - u2|_V, which is at most twice the bound of the split step, and
-        about 0.6 of it in pools; the next step begins likewise if it exceeds three quarters of the
-        splitting tolerance.
+        about 0.6 of it in pools; the next steps begin likewise if it exceeds three quarters of the
+        splitting tolerance. The estimate is made in every fourth of these steps, and kept in
+        between.
 
         Args:
             velocity: velocity of the first projection, each component [m/s] (updated).
@@ -306,12 +310,16 @@ class StokesSolve:
         result = self._iterate(velocity, 0.0, moved, farthest=FARTHEST)
         if not result.used:
             return result
-        error, size = self._splitting_error(), self._size
-        share = error / size if size > 0.0 else 0.0
-        start = operator.kinetic_energy(operator.start)
-        far = share > CONTINUES * self.splitting_tolerance
-        self.continues = far and error > FLOOR * math.sqrt(start)
-        return replace(result, splitting_error=share)
+        self.continues = True
+        if self._steps_to_estimate == 0:
+            error, size = self._splitting_error(), self._size
+            self._share = error / size if size > 0.0 else 0.0
+            start = operator.kinetic_energy(operator.start)
+            far = self._share > CONTINUES * self.splitting_tolerance
+            self.continues = far and error > FLOOR * math.sqrt(start)
+            self._steps_to_estimate = ESTIMATES
+        self._steps_to_estimate -= 1
+        return replace(result, splitting_error=self._share)
 
     def _launch_start_from_last(
         self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array
@@ -465,7 +473,9 @@ class StokesSolve:
         return {
             "coupled_velocity": np.stack([u.numpy() for u in self._last]),
             "coupled_bodies": self._last_bodies.copy(),
-            "coupled": np.array(float(self.continues)),
+            "coupled": np.array(
+                [self.continues, self._steps_to_estimate, self._share], dtype=float
+            ),
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -473,7 +483,8 @@ class StokesSolve:
         for u, values in zip(self._last, state["coupled_velocity"], strict=True):
             u.assign(values)
         self._last_bodies = np.array(state["coupled_bodies"])
-        self.continues = bool(state["coupled"])
+        continues, steps, self._share = (float(v) for v in state["coupled"])
+        self.continues, self._steps_to_estimate = bool(continues), int(steps)
 
     def impulses(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
         """Return the viscous impulses on solids, see `viscous_impulses`."""

@@ -29,7 +29,7 @@ LOAD = KERNELS["gmres.load"]
 KEEP = KERNELS["gmres.keep"]
 # Vectors that a GPU adds before the first reading of a space, and at most before another one.
 FIRST_VECTORS = 2
-MOST_VECTORS = 8
+MOST_VECTORS = 4
 
 
 class FlexibleGMRES:
@@ -37,8 +37,8 @@ class FlexibleGMRES:
 
     The right-hand side is the preconditioner's field `r`, which is overwritten. All preconditioned
     vectors are stored, so that a solution needs no application of the preconditioner. The host
-    reads the columns of H; everything between is one recorded run, if possible. A GPU adds as many
-    vectors before a reading as the rate of convergence so far asks for. Vectors beyond the
+    reads the columns of H; everything between is one recorded run, if possible. A GPU adds several
+    vectors before a reading, by the rate of convergence so far. Vectors beyond the
     tolerance are dropped, so that the result does not depend on this.
     Vectors are made orthogonal once: at residuals of 1e-4 of the start, rounding errors of 1e-7 per
     vector do not count.
@@ -155,14 +155,14 @@ class FlexibleGMRES:
     def _vectors_ahead(self, tolerance: float) -> int:
         """Return how many vectors are added before the next reading.
 
-        As many as a residual needs that goes on falling at its mean rate in this space.
+        Half of those that a residual needs which goes on falling at its mean rate in this space.
         """
         count, left = self.columns, float(abs(self._problem.g[self.columns]))
         if not self.ahead:
             return 1
         vectors = 1 if count else FIRST_VECTORS
         if count and 0.0 < tolerance < left < self._norm:
-            vectors = int(count * math.log(left / tolerance) / math.log(self._norm / left))
+            vectors = int(0.5 * count * math.log(left / tolerance) / math.log(self._norm / left))
         return min(max(vectors, 1), MOST_VECTORS, self._restart - count)
 
     def _launch_first(self) -> None:
