@@ -61,7 +61,8 @@ class StokesResult:
     Attributes:
         splitting_error: |u - u2|_V / |u|_A of the split step, a bound of its error.
         iterations: pairs of a viscous and a pressure cycle; 0 if the split step is kept.
-        error: estimate of the velocity's error, relative to |u|_A.
+        error: estimate of the velocity's error, relative to |u|_A; that of the split step if the
+            solve failed and is not used.
         converged: whether the error is at most the tolerance.
         used: whether velocity and pressure have changed.
         dissipated: energy converted to heat [J; J/m in 2-D].
@@ -430,7 +431,7 @@ class StokesSolve:
         return StokesResult(
             share,
             iterations,
-            relative,
+            relative if used else share,
             converged,
             used,
             energy * operator.dissipated,

@@ -39,7 +39,13 @@ class StokesPreconditioner:
             zeros(self.layout.size, wp.float32, grid.device) for _ in range(4)
         )
         self._coefficient = grid.field()
-        self._viscous_cycle = operator.viscosity.multigrid.light_program()
+        viscosity = operator.viscosity
+        # Light cycles converge worse where viscosities differ by orders of magnitude.
+        self._viscous_cycle = (
+            viscosity.multigrid.light_program()
+            if viscosity.mixed is None
+            else viscosity.multigrid.program
+        )
         self._velocity_residual = self.r[self.layout.velocities]
         self._pressure = GridSystem(operator.projection.operator, wp.float32, bounded=False)
         self._free_cells = operator.free.flatten()

@@ -539,6 +539,10 @@ class Scene(Table):
                 )
         return [*notes, *scene_notes(self)]
 
+    def rank_notes(self) -> list[str]:
+        """Return what has no effect on several ranks, a line each; overridden by subclasses."""
+        return []
+
     def memory_parts(self) -> dict[str, int]:
         """Return the estimated memory of each part of a run on its device [bytes].
 
