@@ -176,7 +176,7 @@ class LiquidScene(ParticleScene):
         ]
 
     def rank_notes(self) -> list[str]:
-        """Return what has no effect on several ranks."""
+        """Return notes on settings without effect on several ranks."""
         return [split_note("on several ranks")] if self.couples else []
 
     def notes(self) -> list[str]:

@@ -45,7 +45,7 @@ SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
 
 
 def processes_started() -> int:
-    """Return the number of processes that mpiexec or srun started; MPI is not initialized."""
+    """Return the number of processes of mpiexec or srun, without MPI."""
     return int(next((os.environ[name] for name in SIZES if name in os.environ), "1"))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import hashlib
-import os
 import pickle
 import signal
 from collections.abc import Callable, Iterator, Sequence

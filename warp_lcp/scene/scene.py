@@ -540,7 +540,10 @@ class Scene(Table):
         return [*notes, *scene_notes(self)]
 
     def rank_notes(self) -> list[str]:
-        """Return what has no effect on several ranks, a line each; overridden by subclasses."""
+        """Return notes on settings without effect on several ranks.
+
+        Subclasses add those of their tables.
+        """
         return []
 
     def memory_parts(self) -> dict[str, int]:
