@@ -22,7 +22,7 @@ from warp_lcp.fluids.models import (
 )
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
-from warp_lcp.fluids.scene import LiquidScene
+from warp_lcp.fluids.scene import LiquidScene, split_note
 from warp_lcp.fluids.stokes import STOKES_COLUMNS, StokesSolve
 from warp_lcp.fluids.surface_tension import REACH
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
@@ -108,10 +108,7 @@ class LiquidSimulation(ParticleSimulation):
         self.measured: dict[str, Row] = {}
         if self.scene.couples and (self.stokes is None or self.stokes.unsupported):
             where = "on several ranks" if self.stokes is None else "with bodies thinner than a cell"
-            self._notes.append(
-                f"viscosity.splitting_tolerance has no effect {where}: pressure and viscosity act "
-                "one after the other"
-            )
+            self._notes.append(split_note(where))
         if self.tension is not None:
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")

@@ -48,6 +48,8 @@ USEFUL = 0.5
 # Steps begin with the last one until the estimated splitting error is below this share of its
 # tolerance. They do not alternate where the estimate is somewhat below the bound.
 CONTINUES = 0.75
+# Steps from the last one between two estimates of the splitting error.
+ESTIMATES = 4
 # Error of the last step as a start, relative to |u|_A, above which the split step is solved.
 FARTHEST = 1.0
 
@@ -59,7 +61,8 @@ class StokesResult:
     Attributes:
         splitting_error: |u - u2|_V / |u|_A of the split step, a bound of its error.
         iterations: pairs of a viscous and a pressure cycle; 0 if the split step is kept.
-        error: estimate of the velocity's error, relative to |u|_A.
+        error: estimate of the velocity's error, relative to |u|_A; that of the split step if the
+            solve failed and is not used.
         converged: whether the error is at most the tolerance.
         used: whether velocity and pressure have changed.
         dissipated: energy converted to heat [J; J/m in 2-D].
@@ -150,6 +153,8 @@ class StokesSolve:
             self._launch_pressure_difference,
         )
         self._krylov: FlexibleGMRES | None = None  # built, with its vectors, at the first use
+        self._size = 0.0  # |u|_A of the last residual
+        self._share, self._steps_to_estimate = 0.0, 0  # the last estimate, see `couple_from_last`
         self.continues = False
         self._last = grid.faces()  # velocity at the end of the last coupled step
         self._last_pressure, self._last_cells = grid.field(wp.float64), grid.field(wp.int8)
@@ -198,7 +203,8 @@ class StokesSolve:
         square, start = self._end.read()[0], self._start.read()[0]
         error, size = math.sqrt(max(power - mass, 0.0)), math.sqrt(square)
         if error > self.splitting_tolerance * size:  # |u|_A is larger than |u|_M
-            dissipated = self.operator.viscous_force(velocity)
+            self.operator.launch_viscous_force(velocity)
+            dissipated = self.operator.read_dissipated()
             size = math.hypot(size, math.sqrt(max(dissipated, 0.0)))
         share = error / size if size > 0.0 else 0.0
         small = error <= FLOOR * math.sqrt(start)
@@ -206,7 +212,7 @@ class StokesSolve:
         if self.unsupported or small or not share > self.splitting_tolerance:
             return StokesResult(share, 0, share, converged=True, used=False)
         result = self.couple(velocity, share, moved)
-        self.continues = result.used
+        self.continues, self._share, self._steps_to_estimate = result.used, share, 0
         return result
 
     def _launch_estimation(
@@ -247,10 +253,10 @@ class StokesSolve:
             self._split_pressure = self._grid.field(wp.float64)
         return self._krylov
 
-    def residual(self, velocity: Sequence[wp.array]) -> None:
+    def residual(self, velocity: Sequence[wp.array], *, outflow: bool = True) -> None:
         """Write the residual to the preconditioner, see `StokesOperator.residual`."""
         preconditioner = self._preconditioner
-        self.operator.residual(velocity, preconditioner.r, preconditioner.work)
+        self.operator.residual(velocity, preconditioner.r, preconditioner.work, outflow=outflow)
 
     def couple(
         self, velocity: Sequence[wp.array], share: float, moved: Callable[[], None]
@@ -281,8 +287,9 @@ class StokesSolve:
 
         With x1 the pressure of the first projection, A (u - u2) = D'(x - x1) up to walls. One
         viscous cycle estimates |u - u2|_V, which is at most twice the bound of the split step, and
-        about 0.6 of it in pools; the next step begins likewise if it exceeds three quarters of the
-        splitting tolerance.
+        about 0.6 of it in pools; the next steps begin likewise if it exceeds three quarters of the
+        splitting tolerance. The estimate is made in every fourth of these steps, and kept in
+        between.
 
         Args:
             velocity: velocity of the first projection, each component [m/s] (updated).
@@ -304,12 +311,16 @@ class StokesSolve:
         result = self._iterate(velocity, 0.0, moved, farthest=FARTHEST)
         if not result.used:
             return result
-        error, size = self._splitting_error(), self._size(velocity)
-        share = error / size if size > 0.0 else 0.0
-        start = operator.kinetic_energy(operator.start)
-        far = share > CONTINUES * self.splitting_tolerance
-        self.continues = far and error > FLOOR * math.sqrt(start)
-        return replace(result, splitting_error=share)
+        self.continues = True
+        if self._steps_to_estimate == 0:
+            error, size = self._splitting_error(), self._size
+            self._share = error / size if size > 0.0 else 0.0
+            start = operator.kinetic_energy(operator.start)
+            far = self._share > CONTINUES * self.splitting_tolerance
+            self.continues = far and error > FLOOR * math.sqrt(start)
+            self._steps_to_estimate = ESTIMATES
+        self._steps_to_estimate -= 1
+        return replace(result, splitting_error=self._share)
 
     def _launch_start_from_last(
         self, velocity: Sequence[wp.array], kind: wp.array, contact: wp.array
@@ -351,11 +362,6 @@ class StokesSolve:
             kind=self._projection.kind,
         )
 
-    def _size(self, velocity: Sequence[wp.array]) -> float:
-        """Return |u|_A, after a residual."""
-        mass = self.operator.kinetic_energy(velocity)
-        return math.sqrt(mass + max(self.operator.dissipated, 0.0))
-
     def _iterate(
         self,
         velocity: Sequence[wp.array],
@@ -375,21 +381,27 @@ class StokesSolve:
         operator, preconditioner = self.operator, self._preconditioner
         preconditioner.set_up(velocity)
         operator.find_free_cells(velocity, FIRST)
-        self.residual(velocity)
+        # Pressures at their bounds change the velocity of faces in walls, and so the outflow.
+        leaks = bool(operator.boundary.open) and self._projection.lower is not None
+        self.residual(velocity, outflow=leaks)
         preconditioner.restrict()
         settled, switched, iterations = self._projection.lower is None, 0, 0
         first = before = left = math.inf
         begins = True  # a new space; otherwise the one before grows
         while True:
-            error, size = preconditioner.estimate(), self._size(velocity)
-            relative = error / size if size > 0.0 else 0.0
+            preconditioner.apply()
+            if begins:
+                krylov.launch_first()  # all launches before the first reading: one wait
+            error, (mass, dissipated) = preconditioner.error(), operator.read_energies()
+            self._size = math.sqrt(mass + max(dissipated, 0.0))
+            relative = error / self._size if self._size > 0.0 else 0.0
             first = min(first, relative)
             stalled = begins and relative > STALLED * before and not switched
             done = relative <= self.tolerance or iterations >= self.max_iterations
             if done or stalled or not math.isfinite(relative) or first > farthest:
                 break
             if begins:
-                left, before = krylov.begin(), relative
+                left, before = krylov.read_first(), relative
             # The estimate of the error falls at least as fast as the norm, in most cases.
             least, switched = min(self.tolerance / relative, 0.5) * left, 0
             while left > least and not switched and not krylov.full:
@@ -404,7 +416,7 @@ class StokesSolve:
                 switched = operator.find_free_cells(velocity, LOOK)
                 settled = not switched
             begins = bool(switched) or krylov.full
-            self.residual(velocity)
+            self.residual(velocity, outflow=leaks and switched > 0)
             if switched:
                 preconditioner.restrict()
         self._viscosity.multigrid.r.zero_()  # see `_launch_estimation`
@@ -419,7 +431,7 @@ class StokesSolve:
         return StokesResult(
             share,
             iterations,
-            relative,
+            relative if used else share,
             converged,
             used,
             energy * operator.dissipated,
@@ -462,7 +474,9 @@ class StokesSolve:
         return {
             "coupled_velocity": np.stack([u.numpy() for u in self._last]),
             "coupled_bodies": self._last_bodies.copy(),
-            "coupled": np.array(float(self.continues)),
+            "coupled": np.array(
+                [self.continues, self._steps_to_estimate, self._share], dtype=float
+            ),
         }
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
@@ -470,7 +484,8 @@ class StokesSolve:
         for u, values in zip(self._last, state["coupled_velocity"], strict=True):
             u.assign(values)
         self._last_bodies = np.array(state["coupled_bodies"])
-        self.continues = bool(state["coupled"])
+        continues, steps, self._share = (float(v) for v in state["coupled"])
+        self.continues, self._steps_to_estimate = bool(continues), int(steps)
 
     def impulses(self, velocity: Sequence[wp.array], points: np.ndarray) -> np.ndarray:
         """Return the viscous impulses on solids, see `viscous_impulses`."""

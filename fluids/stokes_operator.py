@@ -86,8 +86,8 @@ class StokesOperator:
         contact: contact of the cells as of the links in `level`.
         outflows: y of the last residual [m/s].
         bodies: unknowns of rigid bodies; None without any.
-        dissipated, driven: energy dissipated, and the work of walls, at the last residual, in
-            units of the mass of a cell.
+        dissipated, driven: energy dissipated, and the work of walls, of the last `read_energies`,
+            in units of the mass of a cell.
     """
 
     def __init__(
@@ -313,7 +313,7 @@ class StokesOperator:
     # Residual
 
     def find_free_cells(self, velocity: Sequence[wp.array], look: int) -> int:
-        """Determine the free cells; set the pressure of the others to its bound.
+        """Write the outflow; determine the free cells; set the others' pressure to its bound.
 
         Args:
             velocity: u (updated on faces in walls that are partly open).
@@ -323,9 +323,10 @@ class StokesOperator:
             The number of cells that have become free or fixed.
         """
         projection = self.projection
-        if look == LOOK and projection.lower is None:
-            return 0
         self._graphs["_launch_held"].run(velocity)
+        if look == LOOK and projection.lower is None:
+            self._graphs["_launch_divergence"].run(velocity, KEEP)
+            return 0
         switched, worst, most = self._divergence(velocity, KEEP if look == LOOK else FIRST)
         if look == LOOK:
             # Signs of outflows below the residual mean nothing.
@@ -340,17 +341,25 @@ class StokesOperator:
             )
         return int(switched)
 
-    def residual(self, velocity: Sequence[wp.array], r: wp.array, work: wp.array) -> None:
+    def residual(
+        self, velocity: Sequence[wp.array], r: wp.array, work: wp.array, *, outflow: bool
+    ) -> None:
         """Write the residual of velocity and pressure, evaluated in float64.
+
+        `read_energies` reads the energies.
 
         Args:
             velocity: u (updated on faces in walls that are partly open).
             r: the residual, a vector.
             work: another vector (overwritten).
+            outflow: whether the outflow is written, too; otherwise that of `find_free_cells` is
+                taken.
         """
-        self._graphs["_launch_held"].run(velocity)
-        self._graphs["_launch_divergence"].run(velocity, KEEP)
-        self.viscous_force(velocity)
+        if outflow:
+            self._graphs["_launch_held"].run(velocity)
+            self._graphs["_launch_divergence"].run(velocity, KEEP)
+        self.launch_viscous_force(velocity)
+        self._graphs["_launch_kinetic_energy"].run(velocity)
         self._graphs["_launch_residual"].run(velocity, r)
         if self.bodies is not None:
             for part, u in zip(self.layout.components(work), velocity, strict=True):
@@ -455,15 +464,22 @@ class StokesOperator:
 
     # Energies
 
-    def viscous_force(self, velocity: Sequence[wp.array]) -> float:
-        """Write the force -M (u - u*) - tau K u; return the energy dissipated.
-
-        In units of the mass of a cell; the force is in the viscous multigrid's `r`.
-        """
+    def launch_viscous_force(self, velocity: Sequence[wp.array]) -> None:
+        """Write the force -M (u - u*) - tau K u to the viscous multigrid's `r`."""
         self._graphs["_launch_differences"].run(velocity)
-        fields = ViscousFields(velocity, self.projection.kind, self.contact)
-        self.dissipated, self.driven = self.viscosity.force(fields)
+        self.viscosity.launch_force(ViscousFields(velocity, self.projection.kind, self.contact))
+
+    def read_dissipated(self) -> float:
+        """Return the energy dissipated, after `launch_viscous_force`.
+
+        In units of the mass of a cell.
+        """
+        self.dissipated, self.driven = self.viscosity.read_force()
         return self.dissipated
+
+    def read_energies(self) -> tuple[float, float]:
+        """Return |u|_M^2 and the energy dissipated, after `residual`."""
+        return self._end_energy.read()[0], self.read_dissipated()
 
     def _launch_differences(self, velocity: Sequence[wp.array]) -> None:
         """Write u - u* to the viscous solve's change."""

@@ -474,14 +474,19 @@ class Viscosity:
             self._graphs["_set_up"].run(kind, contact, variant=self._placed)
         return ViscousEquations(self._fine, self._above, self._distance, self._slip, self._tau)
 
-    def force(self, fields: ViscousFields) -> tuple[float, float]:
-        """Write the residual for the current `change`, without the response of bodies.
+    def launch_force(self, fields: ViscousFields) -> None:
+        """Write the residual for the current `change`, without the response of bodies."""
+        self._graphs["_residual"].run(fields, True, variant=True)
+        for sums in self._sums:
+            sums.changed()
 
-        Returns:
-            The energy dissipated, and the work of walls, in units of the mass of a cell.
+    def read_force(self) -> tuple[float, float]:
+        """Return energies after `launch_force`, in units of the mass of a cell.
+
+        The energy dissipated, and the work of walls.
         """
-        _, lost, driven, _ = self._force(fields, changed=True, answered=False)
-        return lost + driven, driven
+        _, lost, driven, _ = np.sum([sums.read() for sums in self._sums], axis=0)
+        return float(lost + driven), float(driven)
 
     @property
     def change_field(self) -> wp.array:

@@ -29,6 +29,8 @@ from warp_lcp.multigrid.cycle import CycleStage, Launches
 # Layers of ghost cells that sweeps need: rows of the second color read those of the first, in which
 # odd cells read even ones.
 KNOWN = 3
+# Sweeps of a smoother: of the band of each row, or of all unknowns; those of a light cycle.
+BANDS, LIGHT_BANDS = (True, False, True), (False, True)
 SWEEPS = 4  # sweeps of the coarsest level, each forward and backward
 # Factor on the finer level's `mixed`: twice that is at most `cell`, so that the squares of a cell
 # outweigh its products also in 3-D.
@@ -217,9 +219,7 @@ class ViscosityLevel:
     ) -> Iterator[CycleStage]:
         """Yield steps 1 and 2 of a cycle: sweeps, and restriction of the residual."""
         assert from_zero and not projected, "a V-cycle without bounds"
-        yield from self._beginning()
-        for step in (partial(self.smooth, True), self.residual, partial(self.restrict, coarse)):
-            yield Launches(step)
+        yield from self.down(coarse, BANDS)
 
     def coarsen_bounds(self, coarse: ViscosityLevel) -> tuple[()]:
         """Return an empty tuple, since there are no bounds."""
@@ -227,7 +227,18 @@ class ViscosityLevel:
 
     def ascend(self, coarse: ViscosityLevel, *, projected: bool) -> Iterator[CycleStage]:
         """Yield steps 5 and 6 of a cycle: prolongation and sweeps."""
-        for step in (partial(self.prolong, coarse), partial(self.smooth, False)):
+        yield from self.up(coarse, BANDS)
+
+    def down(self, coarse: ViscosityLevel, bands: Sequence[bool]) -> Iterator[CycleStage]:
+        """Yield sweeps and the restriction of the residual; `bands`: see `smooth`."""
+        yield from self._beginning()
+        smooth = partial(self.smooth, True, bands)
+        for step in (smooth, self.residual, partial(self.restrict, coarse)):
+            yield Launches(step)
+
+    def up(self, coarse: ViscosityLevel, bands: Sequence[bool]) -> Iterator[CycleStage]:
+        """Yield prolongation and sweeps; `bands`: see `smooth`."""
+        for step in (partial(self.prolong, coarse), partial(self.smooth, False, bands)):
             yield Launches(step)
 
     def solve(self, visits: int, *, projected: bool, from_zero: bool) -> Iterator[CycleStage]:
@@ -241,13 +252,13 @@ class ViscosityLevel:
         yield Launches(partial(self.share, self.b))
         yield Launches(self.clear)
 
-    def smooth(self, forth: bool, launch: Launch) -> None:
-        """Relax the band of each row, then all unknowns, then the band again.
+    def smooth(self, forth: bool, bands: Sequence[bool], launch: Launch) -> None:
+        """Relax the band of each row or all unknowns, in the order of `bands` if `forth`.
 
         The band are the unknowns outside of the rows' cores, at surfaces and walls, where errors
-        decay slowly.
+        decay slowly. The order is reversed if not `forth`, so that a cycle is symmetric.
         """
-        for band in (True, False, True):
+        for band in bands if forth else reversed(bands):
             self.sweep(forth, launch, band=band)
 
     def sweep(self, forth: bool, launch: Launch, *, band: bool = False) -> None:
@@ -403,6 +414,33 @@ class ViscosityLevel:
                 diagonal=None,
                 planes=self.grid.planes,
             )
+
+
+@dataclass(frozen=True)
+class LightLevel:
+    """Level of a cycle that relaxes the bands of rows once instead of twice, see `CycleLevel`.
+
+    Args:
+        level: the level.
+    """
+
+    level: ViscosityLevel
+    visits: int = 1
+
+    def descend(
+        self, coarse: LightLevel, *, projected: bool, from_zero: bool
+    ) -> Iterator[CycleStage]:
+        """Yield steps 1 and 2 of a cycle: sweeps, and restriction of the residual."""
+        assert from_zero and not projected, "a V-cycle without bounds"
+        yield from self.level.down(coarse.level, LIGHT_BANDS)
+
+    def coarsen_bounds(self, coarse: LightLevel) -> tuple[()]:
+        """Return an empty tuple, since there are no bounds."""
+        return ()
+
+    def ascend(self, coarse: LightLevel, *, projected: bool) -> Iterator[CycleStage]:
+        """Yield steps 5 and 6 of a cycle: prolongation and sweeps."""
+        yield from self.level.up(coarse.level, LIGHT_BANDS)
 
 
 def join_cores(level: ViscosityLevel) -> None:

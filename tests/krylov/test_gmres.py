@@ -11,6 +11,7 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.krylov import GMRES
+from warp_lcp.krylov.flexible_gmres import FlexibleGMRES
 
 
 class ScalingPreconditioner:
@@ -136,3 +137,28 @@ def test_a_lucky_breakdown_and_a_singular_matrix(device):
     count, norm = krylov.solve(1e-12, 50)
     assert norm == pytest.approx(1.0, rel=1e-2)
     assert np.isfinite(krylov.x.numpy()).all()
+
+
+def extended(device, ahead, tolerances):
+    """Return vectors, estimates and changes of the solution after each tolerance."""
+    matrix, n = convection_diffusion(12, 0.3), 144
+    A = wl.SparseOperator(matrix, device=device)
+    M = ScalingPreconditioner(np.linspace(0.2, 0.5, n), wp.float64, device)
+    weight = wp.full(n, 1.0, dtype=wp.float64, device=device)
+    krylov = FlexibleGMRES(A.product, M, restart=40, weight=weight, at_once=True)
+    krylov.ahead = ahead
+    M.r.assign(np.random.default_rng(4).standard_normal(n))
+    M.apply()
+    norm, results = krylov.begin(), []
+    for tolerance in tolerances:
+        results.append((*krylov.extend(tolerance * norm), krylov.x.numpy()))
+    return results
+
+
+def test_vectors_added_before_a_reading_do_not_change_the_result(device):
+    tolerances = (0.3, 0.2999, 0.02, 1e-4)
+    one, several = (extended(device, ahead, tolerances) for ahead in (False, True))
+    for (count, left, x), (other_count, other_left, other) in zip(one, several, strict=True):
+        assert (count, left) == (other_count, other_left)
+        np.testing.assert_array_equal(x, other)
+    assert sum(count for count, _, _ in one) > 10

@@ -40,6 +40,14 @@ ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 # Environment variables that mpiexec and srun set for their processes.
 RANK = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")
 
+# Environment variables of mpiexec or srun with the number of processes.
+SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
+
+
+def processes_started() -> int:
+    """Return the number of processes of mpiexec or srun, without MPI."""
+    return int(next((os.environ[name] for name in SIZES if name in os.environ), "1"))
+
 
 def rank_here() -> int | None:
     """Return this process's MPI rank, or None if mpiexec started none.

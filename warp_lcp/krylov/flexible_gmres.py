@@ -12,6 +12,7 @@ from warp_lcp.deadline import check_time
 from warp_lcp.kernels import KernelFile
 from warp_lcp.kernels.fields import zeros, zeros_like
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear
+from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.kernels.types import DeviceArray
 from warp_lcp.kernels.vectors import RowReduction, rows_of
@@ -20,11 +21,15 @@ from warp_lcp.krylov.hessenberg import HessenbergLeastSquares
 
 KERNELS = KernelFile(Path(__file__).parent / "headers/krylov.h")
 DOTS = KERNELS["gmres.dots"]
+COLUMN = KERNELS["gmres.column"]
 COMBINE = KERNELS["gmres.combine"]
 STORE = KERNELS["gmres.store"]
 WEIGHED = KERNELS["gmres.weighed"]
 LOAD = KERNELS["gmres.load"]
 KEEP = KERNELS["gmres.keep"]
+# Vectors that a GPU adds before the first reading of a space, and at most before another one.
+FIRST_VECTORS = 2
+MOST_VECTORS = 4
 
 
 class FlexibleGMRES:
@@ -32,7 +37,9 @@ class FlexibleGMRES:
 
     The right-hand side is the preconditioner's field `r`, which is overwritten. All preconditioned
     vectors are stored, so that a solution needs no application of the preconditioner. The host
-    reads a column of H in each iteration; everything between is one recorded run, if possible.
+    reads the columns of H; everything between is one recorded run, if possible. A GPU adds several
+    vectors before a reading, by the rate of convergence so far. Vectors beyond the
+    tolerance are dropped, so that the result does not depend on this.
     Vectors are made orthogonal once: at residuals of 1e-4 of the start, rounding errors of 1e-7 per
     vector do not count.
 
@@ -48,6 +55,7 @@ class FlexibleGMRES:
     Attributes:
         x: the change of the solution by the last `extend`.
         columns: number of vectors.
+        ahead: whether several vectors are added before a reading.
     """
 
     def __init__(
@@ -66,10 +74,13 @@ class FlexibleGMRES:
         self._images = zeros(restart * size, r.dtype, r.device)  # the same, preconditioned
         # Products with them, and a square in the last slot.
         self._sums = RowReduction(rows_of(r), restart + 1, slots=restart + 2)
+        # Columns of H, one row each, with the square of the norm at the end.
+        self._read = DeviceScalar(r.device, restart * (restart + 2))
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)
         self._problem = HessenbergLeastSquares(restart)
         self._place, self._next = Scalar(0), Scalar(1)  # k, and k + 1
-        self._y, self.columns = np.zeros(restart + 1), 0
+        self._y, self.columns, self._norm = np.zeros(restart + 1), 0, 0.0
+        self.ahead = r.device.is_cuda
         at_once = at_once or r.device.is_cuda
         self._first = LaunchGraph(r.device, self._launch_first, at_once=r.device.is_cuda)
         self._before = LaunchGraph(r.device, self._launch_before, at_once=at_once)
@@ -83,12 +94,21 @@ class FlexibleGMRES:
 
     def begin(self) -> float:
         """Begin a space with the residual r, whose image z is known; return the norm."""
+        self.launch_first()
+        return self.read_first()
+
+    def launch_first(self) -> None:
+        """Launch the first vector of a space; z is scaled. `read_first` returns the norm."""
         self.columns = 0
         self._y[:] = 0.0
         self._first.run()
-        norm = float(np.sqrt(self._sums.reading.numpy()[self._restart + 1]))
-        self._problem.begin(norm)
-        return norm
+        self._sums.reading.changed()
+
+    def read_first(self) -> float:
+        """Return the norm of the residual after `launch_first`."""
+        self._norm = float(np.sqrt(self._sums.reading.numpy()[self._restart + 1]))
+        self._problem.begin(self._norm)
+        return self._norm
 
     def extend(self, tolerance: float) -> tuple[int, float]:
         """Add vectors until the estimate of the residual is at most the tolerance.
@@ -105,22 +125,25 @@ class FlexibleGMRES:
         Returns:
             The number of vectors added, and the estimate.
         """
-        problem, first = self._problem, self.columns
-        while not self.full:
+        problem, first, done = self._problem, self.columns, False
+        while not done and not self.full:
             check_time()
-            k = self.columns
-            self._place.value, self._next.value = k, k + 1
-            if k:
-                self._before.run()
-            self._after.run()
-            self._sums.reading.changed()
-            found = self._sums.reading.numpy()
-            problem.H[: k + 1, k] = found[: k + 1]
-            problem.H[k + 1, k] = np.sqrt(found[-1])
-            problem.rotate(k)
-            self.columns = k + 1
-            if not abs(problem.g[k + 1]) > tolerance:  # also if it is NaN
-                break
+            new = range(self.columns, self.columns + self._vectors_ahead(tolerance))
+            for k in new:
+                self._place.value, self._next.value = k, k + 1
+                if k:
+                    self._before.run()
+                self._after.run()
+            self._read.changed()
+            read = self._read.numpy().reshape(self._restart, -1)
+            for k in new:
+                problem.H[: k + 1, k] = read[k, : k + 1]
+                problem.H[k + 1, k] = np.sqrt(read[k, -1])
+                problem.rotate(k)
+                self.columns = k + 1
+                done = not abs(problem.g[k + 1]) > tolerance  # also if it is NaN
+                if done:
+                    break
         y = problem.solve(self.columns)
         self._factors.assign(y - self._y)
         self._y = y
@@ -128,6 +151,19 @@ class FlexibleGMRES:
         self._end.run()
         left = float(abs(problem.g[self.columns]))
         return self.columns - first, left if math.isfinite(left) else math.inf
+
+    def _vectors_ahead(self, tolerance: float) -> int:
+        """Return how many vectors are added before the next reading.
+
+        Half of those that a residual needs which goes on falling at its mean rate in this space.
+        """
+        count, left = self.columns, float(abs(self._problem.g[self.columns]))
+        if not self.ahead:
+            return 1
+        vectors = 1 if count else FIRST_VECTORS
+        if count and 0.0 < tolerance < left < self._norm:
+            vectors = int(0.5 * count * math.log(left / tolerance) / math.log(self._norm / left))
+        return min(max(vectors, 1), MOST_VECTORS, self._restart - count)
 
     def _launch_first(self) -> None:
         """Store the normalized residual as the first vector; scale its image."""
@@ -171,6 +207,10 @@ class FlexibleGMRES:
             sign=-1.0,
         )
         self._store(self._next, self._basis, q)
+        sums = self._sums.scalars
+        COLUMN.bind(
+            rows_of(sums), columns=self._read.array, size=sums.size, place=self._place, sums=sums
+        ).launch()
 
     def _launch_end(self) -> None:
         """Write the sum of factors_j M v_j to x."""

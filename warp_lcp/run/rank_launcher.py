@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import hashlib
-import os
 import pickle
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -33,8 +32,6 @@ from warp_lcp.scene.table import written
 from warp_lcp.simulation import InputError, SimulationFailed, StepFailed
 
 PLANNED = (OSError, InputError, StepFailed, SimulationFailed)
-# Environment variables of mpiexec or srun with the number of processes.
-SIZES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "SLURM_STEP_NUM_TASKS")
 SHOWN = 4  # differences shown in a message
 # Seconds for a process to exit at the end, while PETSc and MPI synchronize for the last time.
 PARTING = 60
@@ -187,8 +184,8 @@ def ranks_together(rank_timeout: float) -> Iterator[RankLauncher]:
         if launch.rank_here():
             raise typer.Exit(2) from error
         raise EngineError(f"--engine petsc: {error}") from error
-    started = next((os.environ[name] for name in SIZES if name in os.environ), "1")
-    if started != "1" and ranks.size == 1:
+    started = launch.processes_started()
+    if started != 1 and ranks.size == 1:
         raise EngineError(
             f"--engine petsc: {started} processes were started, but mpi4py sees only one: the MPI "
             "libraries differ; use the mpiexec "

@@ -116,6 +116,15 @@ for (int j = 0; j < count; ++j) {
         *sum = P.more ? *sum + vx : vx;
 }
 
+// kernel gmres.column: Store the sums of an iteration as a column of H
+//   compute    float64
+//   reads      float64 sums
+//   whole      float64 columns
+//   numbers    int64 size, place
+//   by_cell
+auto* column = columns + place * size + p;
+for (int k = 0; k < n; ++k) column[k] = sums[k];
+
 // kernel gmres.combine: x += sign times sum_j factors_j v_j; x'x
 //   compute    S
 //   writes     S x
