@@ -79,6 +79,8 @@ class MaterialTable(Table):
     """[material]: properties of the grains."""
 
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
+    # Under its old name the angle of repose was that of layers, k = tan.
+    renamed_values: ClassVar = {"angle_of": {"repose": "simple-shear"}}
     name: Literal["dry-sand", "gravel", "sugar"] = Field(
         default="dry-sand", description="material that gives the defaults"
     )
@@ -274,6 +276,16 @@ class SandScene(ParticleScene):
     def preset(self) -> Material:
         """Return the named material."""
         return MATERIALS[self.material.name]
+
+    @property
+    def corrects_steadily(self) -> bool:
+        """Return whether the density is corrected in all steps that `correction.every` names.
+
+        So it is where axes are periodic or solids move: sand is sheared for long there, and packs
+        by 4 % before many cells are overfull.
+        """
+        moved = any(solid.motion is not None for solid in self.solid)
+        return super().corrects_steadily or bool(self.endless) or moved
 
     @property
     def friction_angle(self) -> float:
