@@ -342,9 +342,9 @@ def wall_motion_kernel(
     """Compute the velocity of the wall in a cell, and the rate at which it frees space.
 
     The velocity is turn x + shift [m/s] at the center of the cell. The rate, times dx / volume, is
-    the sum over the cell's faces of the outward flux of the solids, which fill their closed parts:
-    what leaves the cell there frees as much space in it. On a side of the domain, which its wall
-    closes for good, this part is 1 - the open fraction, of the solid of this cell.
+    the sum over the cell's faces of the outward flux (1 - a) v of the solids, with the open
+    fraction a and the solids' velocity v there: what leaves the cell frees as much space in it. A
+    side of the domain is closed by the domain's wall; there v is that of the solid in this cell.
     """
     cell = cells[i]
     rows, columns = swept.shape[1], swept.shape[2]
@@ -365,18 +365,17 @@ def wall_motion_kernel(
                 m = j + wp.where(axis == 1, side, 0)
                 o = l + wp.where(axis == 0, side, 0)
                 wall = int(wall_x[n, m, o])
-                flux = velocity_x[n, m, o]
+                speed = velocity_x[n, m, o]
                 if axis == 1:
                     wall = int(wall_y[n, m, o])
-                    flux = velocity_y[n, m, o]
+                    speed = velocity_y[n, m, o]
                 if axis == 2:
                     wall = int(wall_z[n, m, o])
-                    flux = velocity_z[n, m, o]
+                    speed = velocity_z[n, m, o]
                 if wall == 0:
                     beyond = float(2 * side - 1) * 0.5 * spacing
-                    flux = (1.0 - openings[axis, n, m, o]) * (
-                        at[axis] + turn[number][axis, axis] * beyond
-                    )
+                    speed = at[axis] + turn[number][axis, axis] * beyond
+                flux = (1.0 - openings[axis, n, m, o]) * speed
                 rate += float(2 * side - 1) * flux
         swept[k, j, l] = rate
 

@@ -67,8 +67,8 @@ class SandDomain(Domain):
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
         description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move; "
-        "stresses treat solids as whole cells if one moves, an axis is periodic or solver.method = "
-        '"interleaved-sweeps"',
+        "stresses treat solids as whole cells if sand moves one, thin ones move, an axis is "
+        'periodic or solver.method = "interleaved-sweeps"',
     )
     periodic: list[bool] | None = Field(
         default=None, description="periodic axes, [x, y] or [x, y, z]; not y"

@@ -208,7 +208,8 @@ def bagnold(y: np.ndarray, depth: float, fall: float) -> np.ndarray:
 def test_a_layer_that_runs_for_long_keeps_its_height(tables: dict[str, Any]) -> None:
     """Height of glass beads that run down 26 degrees by mu(I), after 0.25 s.
 
-    Where an axis is periodic, the table is the default. Without a correction the layer packs to 0.86 of its mean height. The profile is Bagnold's, see
+    Where an axis is periodic, the table is the default. Without a correction the layer packs to
+    0.86 of its mean height. The profile is Bagnold's, see
     `warp_lcp.benchmarks.validation.inclined`.
     """
     depth, slope, static, dynamic, grain = 0.04, 26.0, 20.9, 32.76, 5.3e-4
