@@ -279,7 +279,7 @@ class SandScene(ParticleScene):
 
     @property
     def corrects_steadily(self) -> bool:
-        """Return whether the density is corrected in all steps that `correction.every` names.
+        """Return whether each step of `correction.every` corrects the density.
 
         So it is where axes are periodic or solids move: sand is sheared for long there, and packs
         by 4 % before many cells are overfull.

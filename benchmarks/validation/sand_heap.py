@@ -1,13 +1,10 @@
-"""Heaps of slowly poured sand: slope, shape and rest; cones in 3-D; rest of flatter wedges.
+"""Heaps of slowly poured sand: slope, shape and rest; rest of flatter wedges.
 
 If the slope of the yield set is k, a running layer stops at atan k: a layer that slides along a
 slope is in simple shear, with equal normal stresses. Resting sand has pushed against itself along
 the slope, and so rests up to asin k. The slope of a heap lies between the two: with k = (sin + tan)
 / 2 of the angle of repose between 19.4 and 20.7 at 20 degrees, 28.3 and 32.6 at 30, 32.5 and 39.6
 at 35. The check measures its difference from the angle of repose.
-
-In 3-D sand is poured from a point to a cone, and from a line between smooth walls to a wedge, at
-the same rate per area of the source. Both are fitted like the heaps in 2-D.
 """
 
 from __future__ import annotations
@@ -43,12 +40,6 @@ NEAR, ALIKE, CREEP = 2.0, 1.5, 0.2
 # Wedge: degrees below the angle; [m]; [s]; share of its height.
 BELOW, BASE, STANDS, SHRINKS = 3.0, 0.9, 5.0, 0.01
 CONTROLLED = 30.0  # degrees, of the negative control
-# Heaps in 3-D: cells of the domain's length; [m] length, height and depth of the wedge in cells;
-# source; [m] radius at the angle of repose; degrees of difference between cone and wedge.
-CONES = (24, 36)
-SPACE, TALL, SLICE = 0.48, 0.3, 4
-FALL, NOZZLE, RADIUS = 0.2, 0.06, 0.15
-CONE_NEAR, CONE_ALIKE = 4.0, 4.0
 HIGHEST = 3  # number of columns whose mean is the height
 Outline = tuple[np.ndarray, np.ndarray]  # x and y [m]
 
@@ -80,25 +71,6 @@ def heaps(findings: Findings, cells: int, angles: Sequence[float] = ANGLES) -> N
         low, high = CONTROLLED - NEAR, CONTROLLED + NEAR
         flat = pour(cells, half_as_steep(CONTROLLED), lasts=SETTLES).angle
         findings.must_break("half the friction: heap", flat, low=low, high=high, unit="degrees")
-
-
-@check_at("sand cone", "{cells} cells of length, 3-D")
-def cones(findings: Findings, cells: int, angle: float = CONTROLLED) -> None:
-    """Pour a cone and a wedge in 3-D."""
-    slopes = []
-    for name, round_ in (("cone", True), ("wedge", False)):
-        heap = pour_in_space(cells, angle, cone=round_)
-        slopes.append(heap.angle)
-        findings.add(
-            f"{name}: angle",
-            heap.angle,
-            low=angle - CONE_NEAR,
-            high=angle + CONE_NEAR,
-            unit="degrees",
-        )
-        findings.add(f"{name}: steps within the error", heap.solved, low=95.0, unit="%")
-    apart = abs(slopes[0] - slopes[1])
-    findings.add("|cone less wedge|", apart, high=CONE_ALIKE, unit="degrees")
 
 
 @check_at("sand wedge", "{cells} cells of length")
@@ -146,75 +118,6 @@ def pour(cells: int, angle: float, *, lasts: float = LASTS, **tables: TableValue
     last, misses, top = fit((x, y), wedge)
     creep = (first - last) / (lasts - SETTLES) if lasts > SETTLES else 0.0
     return Heap(first, creep, misses / top, share_solved(rows), (x, y))
-
-
-def pour_in_space(cells: int, angle: float, *, cone: bool) -> Heap:
-    """Pour a heap in 3-D: a cone, or a wedge between smooth walls.
-
-    The wedge is `SLICE` cells deep, on a rough plate. Without an observation of creep.
-
-    Args:
-        cells: cells of the domain's length.
-        angle: angle of repose [degrees].
-        cone: a cone; else a wedge.
-    """
-    middle, tangent, dx = 0.5 * SPACE, math.tan(math.radians(angle)), SPACE / cells
-    deep, floor = (SPACE, 0.0) if cone else (SLICE * dx, 2.0 * dx)
-    half = 0.5 * NOZZLE
-    back, front = (middle - half, middle + half) if cone else (0.0, deep)
-    volume = math.pi / 3.0 * RADIUS**3 * tangent if cone else RADIUS**2 * tangent * deep
-    stop = volume / (SPEED * NOZZLE * (front - back))
-    low, high = [middle - half, floor + FALL, back], [middle + half, floor + FALL + LIP, front]
-    source = [box(low, high, velocity=[0.0, -SPEED, 0.0], stop=stop)]
-    seed = box([middle - half, floor, back], [middle + half, floor + LIP, front])
-    plate = box([-1.0, -1.0, -1.0], [2.0, floor, 2.0], friction="stick")
-    simulation = create_sand(
-        [SPACE, TALL, deep],
-        cells,
-        [seed],
-        [] if cone else [plate],
-        walls="stick" if cone else 0.0,
-        material={"friction_angle": angle},
-        source=source,
-    )
-    rows = list(steps(simulation, stop + SETTLES))
-    nx, _, nz = simulation.grid.counts
-    at = simulation.particles.position.numpy().astype(np.float64)
-    i, k = (np.minimum((at[:, axis] / dx).astype(int), n - 1) for axis, n in ((0, nx), (2, nz)))
-    area = simulation.particle_mass / simulation.scene.physics.density / dx
-    depth = np.bincount(i * nz + k, minlength=nx * nz).reshape(nx, nz) * area / dx
-    x = (np.arange(nx) + 0.5) * dx
-    if cone:
-        slope, misses, top = fit_cone(x, (np.arange(nz) + 0.5) * dx, depth)
-    else:
-        slope, misses, top = fit((x, depth.mean(axis=1)), wedge)
-    return Heap(slope, 0.0, misses / top, share_solved(rows), (x, depth[:, nz // 2]))
-
-
-def fit_cone(x: np.ndarray, z: np.ndarray, depth: np.ndarray) -> tuple[float, float, float]:
-    """Return angle [degrees], error [m], height [m] of a cone fitted to depths by least squares.
-
-    Args:
-        x: centers of columns [m], shape (n,).
-        z: likewise, shape (m,).
-        depth: depths of sand [m], shape (n, m).
-    """
-    along, across = np.meshgrid(x, z, indexing="ij")
-    middle = [float(np.average(places, weights=depth)) for places in (along, across)]
-
-    def distance(p: np.ndarray) -> float:
-        radius = np.hypot(along - p[2], across - p[3])
-        return float(np.sum((p[0] * wedge(radius / p[1]) - depth) ** 2))
-
-    best = minimize(
-        distance,
-        [float(depth.max()), RADIUS, *middle],
-        method="Nelder-Mead",
-        options={"xatol": 1e-6, "fatol": 1e-12, "maxiter": 4000},
-    )
-    top, radius = best.x[:2]
-    misses = math.sqrt(best.fun / np.count_nonzero(depth))
-    return math.degrees(math.atan(top / radius)), misses, float(top)
 
 
 def lost(cells: int, angle: float, *, duration: float = STANDS, **tables: TableValue) -> float:
@@ -320,7 +223,7 @@ def alike(findings: Findings, trials: Sequence[ValidationTrial]) -> None:
 
 CHECK = ValidationCheck(
     about=__doc__ or "",
-    trials=[(heaps, RESOLUTIONS), (wedges, RESOLUTIONS), (cones, CONES)],
+    trials=[(heaps, RESOLUTIONS), (wedges, RESOLUTIONS)],
     across=("both", alike),
     charts=[plot("sand-heaps", "Heaps and wedges", "x [m]", "y [m]")],
     known="single heaps differ by up to 1.4 degrees from the mean over seeds of the particles; at "

@@ -190,9 +190,9 @@ class ParticleScene(Scene):
 
     @property
     def corrects_steadily(self) -> bool:
-        """Return whether the density is corrected in all steps that `correction.every` names.
+        """Return whether each step of `correction.every` corrects the density.
 
-        Otherwise it is corrected in those that begin with overfull cells, see `most_crowded`.
+        Otherwise only steps that begin with overfull cells do, see `most_crowded`.
         """
         return self.density_correction is not None
 
