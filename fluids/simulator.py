@@ -242,7 +242,7 @@ class LiquidSimulation(ParticleSimulation):
         self.grid_to_particles(window, self.projection.kind, dt)
         if self.tension is not None:
             self.tension.damp_velocity_gradients(self.particles, dt)
-        liquid_cells = window.now  # the move changes the active window
+        liquid_cells = window.current  # the move changes the active window
         row = (
             self.move(dt, window, self.surface.density, self.projection.contact)
             | self._advance_whitewater(liquid_cells, dt)

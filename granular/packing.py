@@ -45,7 +45,7 @@ class Packing:
         capacity: float32, open share of a cell's kernel.
         sides: exchange across periodic axes, if any.
         cut: solids that cut cells, if any; only the cells that they fill completely are SOLID in
-            `base`.
+            `base`, and no face has their velocity in `update`.
 
     Attributes:
         base: the argument of the same name.
@@ -250,8 +250,10 @@ class Packing:
             put(kernels.Faces(), dict(zip("xyz", fields, strict=False)))
             for fields in (self.mass, self.start, self.inverse)
         )
+        swept = None if self.cut is None else self.cut.swept
         cells.launch(
-            kernels.front_kernel, [dimension, self._rate, openings, mass, start, self.drive]
+            kernels.front_kernel,
+            [dimension, self._rate, openings, mass, start, self.fraction, swept, self.drive],
         )
         for (alpha, beta), part, share in zip(SHEARS[dimension], around, self.share, strict=False):
             nodes.launch(

@@ -202,13 +202,27 @@ def face_kernel(
 
 @cell_kernel("granular.packing")
 def front_kernel(
-    k, j, i, dimension: int, rate: float, openings: _F32X, mass: Faces, start: Faces, drive: F32
+    k,
+    j,
+    i,
+    dimension: int,
+    rate: float,
+    openings: _F32X,
+    mass: Faces,
+    start: Faces,
+    fraction: F32,
+    swept: F32,
+    drive: F32,
 ):
     """Close cells that only the mass flux of translating sand would compress.
 
     Where a front of sand moves through a cell, its profile is smooth over two cells, and the flux
     of its mass through the faces, a central difference, fills the cell beyond its free volume
     although nothing is compressed. Such a cell counts as full: only its volume is kept then.
+
+    Where moving walls free space in a cell at the rate `swept` [m/s], the last layer of `openings`
+    gets the part of it that counts for the cell's sand: all in full cells, its fraction in loose
+    ones, as on faces.
     """
     # w = drive + div(m' u) as in the snippet `divergence` of `sand.h`, at the velocity u before the
     # stresses, and div u; both times dx [m/s]. With drive = 0 the first becomes the second.
@@ -227,8 +241,16 @@ def front_kernel(
             high = high * openings[axis, n, m, l]
         w += (above + full * (1.0 - above)) * high - (below + full * (1.0 - below)) * low
         volume += high - low
+    if swept:
+        phi = fraction[k, j, i]
+        w += (phi + full * (1.0 - phi)) * swept[k, j, i]
+        volume += swept[k, j, i]
     if free > 0.0 and w < wp.min(volume, 0.0):
         drive[k, j, i] = 0.0
+        full = float(1.0)
+    if swept:
+        phi = fraction[k, j, i]
+        openings[2 * dimension, k, j, i] = (phi + full * (1.0 - phi)) * swept[k, j, i]
 
 
 @wp.func

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
+from warp_lcp.granular.cut_walls import cut_kind
 from warp_lcp.granular.report_kernels import contact_kernel, report_pass, solved_velocity_kernel
 from warp_lcp.granular.stress import Stress
 from warp_lcp.grid.staggered import Window
@@ -38,7 +39,7 @@ class SandReport:
         )
         cut, stored = stress.packing.cut, Window((0, 0, 0), grid.shape, grid.device)
         self._report = WindowReduction(
-            report_pass(grid.dimension, stress.rate, cut is not None), grid, stored
+            report_pass(grid.dimension, stress.rate, cut_kind(cut)), grid, stored
         )
         self._taking, self._reporting = (
             LaunchGraph(grid.device, record)

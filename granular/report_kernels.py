@@ -19,12 +19,14 @@ KERNELS = KernelFile(
 
 
 @functools.cache
-def report_pass(dimension: int, rate: bool = False, cut: bool = False) -> StencilKernel:
+def report_pass(dimension: int, rate: bool = False, cut: int = 0) -> StencilKernel:
     """Return the kernel for 2 or 3 dimensions.
 
-    `rate`: friction depends on the shear rate. `cut`: solids cut cells.
+    `rate`: friction depends on the shear rate. `cut`: 1 if solids cut cells, 2 if some of them
+    move.
     """
-    module = f"granular.report_{dimension}d{'_rate' * rate}{'_cut' * cut}"
+    kind = ("", "_cut", "_cut_moving")[cut]
+    module = f"granular.report_{dimension}d{'_rate' * rate}{kind}"
     return KERNELS.kernel(
         "granular.report.report",
         module=module,

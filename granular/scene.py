@@ -67,8 +67,8 @@ class SandDomain(Domain):
     solids: Literal["cut-cell", "voxel"] = Field(
         default="cut-cell",
         description="cut-cell: surfaces cut cells; voxel: solids fill whole cells and cannot move; "
-        "stresses treat solids as whole cells if one moves, an axis is periodic or solver.method = "
-        '"interleaved-sweeps"',
+        "stresses treat solids as whole cells if sand moves one, thin ones move, an axis is "
+        'periodic or solver.method = "interleaved-sweeps"',
     )
     periodic: list[bool] | None = Field(
         default=None, description="periodic axes, [x, y] or [x, y, z]; not y"
@@ -79,6 +79,8 @@ class MaterialTable(Table):
     """[material]: properties of the grains."""
 
     renamed: ClassVar = {"angle_of": "friction_angle_test"}
+    # Under its old name the angle of repose was that of layers, k = tan.
+    renamed_values: ClassVar = {"angle_of": {"repose": "simple-shear"}}
     name: Literal["dry-sand", "gravel", "sugar"] = Field(
         default="dry-sand", description="material that gives the defaults"
     )
@@ -275,6 +277,16 @@ class SandScene(ParticleScene):
     def preset(self) -> Material:
         """Return the named material."""
         return MATERIALS[self.material.name]
+
+    @property
+    def corrects_steadily(self) -> bool:
+        """Return whether each step of `correction.every` corrects the density.
+
+        So it is where axes are periodic or solids move: sand is sheared for long there, and packs
+        by 4 % before many cells are overfull.
+        """
+        moved = any(solid.motion is not None for solid in self.solid)
+        return super().corrects_steadily or bool(self.endless) or moved
 
     @property
     def friction_angle(self) -> float:

@@ -377,14 +377,18 @@ class SandSimulation(ParticleSimulation):
     def _place_solids(self) -> None:
         """Place the moving solids at their current positions."""
         if self.solids.moves:
-            self.solids.place(self.time)
-            if self.solids.walls is not self.stress.walls:
+            cut = self.solids.cut
+            listed = 0 if cut is None else cut.count
+            left = self.solids.place(self.time)
+            self.stress.forget_tractions(left)
+            longer = cut is not None and cut.count != listed
+            if longer or self.solids.walls is not self.stress.walls:
                 self.stress.set_walls(self.solids.walls)
             if self.carried is not None and self.bodies is not None:
                 centers = np.array([body.position for body in self.bodies.bodies])
                 self.carried.place(self.solids.host_index, centers, self.solids.walls)
 
-    def _gains(self, scale: float) -> bool:
+    def _gains(self, scale: float, dt: float) -> bool:
         """Return whether the stresses accelerate sand beyond all of its sources of speed.
 
         These are the speeds of sand, solids, sources and bodies before the step, and that due to
@@ -400,14 +404,19 @@ class SandSimulation(ParticleSimulation):
             ]
             for velocity in (self.stress.checked.u, packing.start)
         )
-        others = self._speed_of_solids()
+        others = self._speed_of_solids(dt)
         fastest, *before = self._largest([max(after), *before])
         bodies = self.bodies.top_speed(0.0) if self.bodies is not None else 0.0
         return fastest > math.hypot(*before) + scale + others + bodies
 
-    def _speed_of_solids(self) -> float:
-        """Return the largest velocity component of the solids' faces [m/s]; collective."""
+    def _speed_of_solids(self, dt: float) -> float:
+        """Return the largest velocity component of the solids' faces [m/s]; collective.
+
+        For solids that cut cells, their largest speed in the step of length `dt` [s].
+        """
         own = self._own
+        if self.solids.cut is not None and self.solids.moves:
+            return self._largest([self.boundary.top_speed(self.time, dt)])[0]
         fastest = max(
             (float(np.abs(own(component)).max()) for component in self.solids.velocity), default=0.0
         )
@@ -485,8 +494,8 @@ class SandSimulation(ParticleSimulation):
         if (
             solved.status is not wl.SolveStatus.CONVERGED
             and residual > FAR
-            and residual * scale > DRIVEN * self._speed_of_solids()
-            and self._gains(scale)
+            and residual * scale > DRIVEN * self._speed_of_solids(dt)
+            and self._gains(scale, dt)
         ):
             stress.roll_back()
             left = (

@@ -10,7 +10,8 @@ import warp as wp
 
 import warp_lcp as wl
 from warp_lcp.granular.bodies import SandBodies
-from warp_lcp.granular.cut_walls import WALL_FACE
+from warp_lcp.granular.bodies_kernels import forget_kernel
+from warp_lcp.granular.cut_walls import WALL_FACE, cut_kind
 from warp_lcp.granular.fields import StressFields, VelocityFields
 from warp_lcp.granular.packing import REACH, SHEARS, Packing
 from warp_lcp.granular.stress_kernels import (
@@ -89,7 +90,7 @@ class Velocity:
         self.edge = [grid.field(real) for _ in SHEARS[grid.dimension]]
         self.openings = None if packing.cut is None else packing.cut.openings
         self.passes = stress_passes(
-            grid.dimension, real, box=box, rate=rate, cut=packing.cut is not None
+            grid.dimension, real, box=box, rate=rate, cut=cut_kind(packing.cut)
         )
 
     @property
@@ -250,6 +251,22 @@ class Stress(wl.VariationalInequality):
             if threads
             else None
         )
+
+    def forget_tractions(self, cells: np.ndarray) -> None:
+        """Set the wall friction to 0 in cells that moving walls have left.
+
+        Args:
+            cells: flat indices, shape (n,).
+        """
+        if len(cells) == 0:
+            return
+        grid = self.packing.grid
+        first = self.now.shape[0] - grid.dimension
+        slots = (np.arange(first, first + grid.dimension)[:, None] * grid.size + cells).ravel()
+        device = grid.device
+        listed = wp.array(slots, dtype=wp.int32, device=device)
+        fields = [field.flatten() for field in (self.now, self._before, self._point)]
+        wp.launch(forget_kernel, len(slots), [listed, *fields], device=device)
 
     def begin(self, bound: YieldSet, gravity: np.ndarray, dt: float, kick_dt: float) -> None:
         """Start from the last stresses, in cells that allow them in the new packing.

@@ -81,14 +81,16 @@ class StressKernels:
 
 @functools.cache
 def stress_passes(
-    dimension: int, real: type, *, box: bool = False, rate: bool = False, cut: bool = False
+    dimension: int, real: type, *, box: bool = False, rate: bool = False, cut: int = 0
 ) -> StressKernels:
     """Return the kernels for 2 or 3 dimensions.
 
-    Steps have velocities in float32, the natural residual in float64.
+    Steps have velocities in float32, the natural residual in float64. `cut`: 1 if solids cut cells,
+    2 if some of them move.
     """
     residual = real is F64
-    kind = ("residual" if residual else "step") + "_box" * box + "_rate" * rate + "_cut" * cut
+    kind = ("residual" if residual else "step") + "_box" * box + "_rate" * rate
+    kind += ("", "_cut", "_cut_moving")[cut]
     module = f"granular.stress_{dimension}d_{real.__name__}_{kind}"
     words = {
         "DIM": dimension,

@@ -19,6 +19,7 @@ from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.kernels.launch_graph import LaunchGraph, clear, launch
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.boundary import Boundary, CutBoundary, Faces
+from warp_lcp.rigid.body import BodyMotion
 
 INTS, BYTES = wp.array(dtype=wp.int32), wp.array(dtype=wp.uint8)
 CUDA_LISTS = 1024  # parts of the list of faces, one per thread on a GPU
@@ -148,13 +149,15 @@ class SandSolids:
         friction: Coulomb's coefficient of the domain's walls and of each solid.
         prescribed: allocate velocities on faces even if no solid moves, since sources prescribe
             some.
-        cuts: let solids at rest cut cells for the stresses too, if they do so in `boundary`.
+        cuts: let solids cut cells for the stresses too, if they do so in `boundary`; not along
+            periodic axes, with bodies that sand moves, or moving solids thinner than cells.
 
     Attributes:
         cut: open fractions and walls of cut cells; None if solids are whole cells.
         index: int32, -1 in open cells, the wall number elsewhere.
         base: int8, SOLID or AIR.
-        velocity: velocity of the solids on each component's faces [m/s]; empty if they are at rest.
+        velocity: velocity of whole cells of solids, and of sources, on each component's faces
+            [m/s]; empty if there is none.
         separating: uint8 of each wall: all ones.
         walls: faces between open cells and solids; a new object whenever cells have changed.
         notes: warnings for the start of a run.
@@ -180,7 +183,6 @@ class SandSolids:
         )
         self.base, self.index = grid.field(wp.int8), grid.field(wp.int32)
         self.separating = wp.full(1 + len(placed), 1, dtype=wp.uint8, device=grid.device)
-        self.velocity: Faces = grid.faces() if boundary.moves or prescribed else []
         self._setting = LaunchGraph(grid.device, self._launch_velocity)
         # Middles of the solids, whose images along periodic axes have their velocity; lengths of
         # these axes.
@@ -191,20 +193,22 @@ class SandSolids:
             endless = [axis in boundary.sides.endless for axis in range(3)]
             self._length = wp.vec3(*np.where(endless, grid.extent, 0.0))
         self._cells: np.ndarray | None = None  # `index` for which `walls` was built
-        fits = (
-            cuts
-            and isinstance(boundary, CutBoundary)
-            and not boundary.moves
-            and boundary.sides is None
-        )
+        self._floats = any(isinstance(solid.motion, BodyMotion) for solid in placed)
         self.cut = (
             CutWalls(grid, boundary.cut, friction, self._counted)
-            if fits and isinstance(boundary, CutBoundary)
+            if cuts and isinstance(boundary, CutBoundary) and self._fit(boundary)
             else None
         )
+        whole_cells_move = boundary.moves and self.cut is None
+        self.velocity: Faces = grid.faces() if whole_cells_move or prescribed else []
         self.place(0.0)
         whole = isinstance(boundary, CutBoundary) and self.cut is None
         self.notes = (*self._thin_notes(), *((self._whole_note(cuts),) if whole else ()))
+
+    def _fit(self, boundary: CutBoundary) -> bool:
+        """Return whether the solids can cut cells for the stresses."""
+        thin_ones_move = boundary.moves and boundary.barriers is not None
+        return boundary.sides is None and not self._floats and not thin_ones_move
 
     @property
     def host_index(self) -> np.ndarray:
@@ -217,9 +221,16 @@ class SandSolids:
         """Return whether a solid moves."""
         return self._boundary.moves
 
-    def place(self, time: float) -> None:
-        """Place the solids at their positions at `time` [s]."""
+    def place(self, time: float) -> np.ndarray:
+        """Place the solids at their positions at `time` [s], after those of `boundary`.
+
+        Returns:
+            Flat indices of the cells in which a wall that cut them is gone.
+        """
         grid = self.grid
+        if self.cut is not None and self._cells is not None:
+            wp.copy(self.base, self._boundary.base)
+            return self.cut.place()
         now = [
             solid
             if solid.motion is None
@@ -255,11 +266,12 @@ class SandSolids:
             grid.interior(cells)[...] = -1
         # Otherwise recorded launches for these walls stay valid.
         if self._cells is None or not np.array_equal(cells, self._cells):
-            rubbing = not self.moves
+            rubbing = not self.moves or self.cut is not None
             self._cells, self.walls = (
                 cells.copy(),
                 SandWalls(grid, cells, self._friction, rubbing_only=rubbing, counted=self._counted),
             )
+        return np.zeros(0, dtype=np.int64)
 
     def _thin_notes(self) -> tuple[str, ...]:
         """Return a warning for each solid at rest that is too thin for the stresses."""
@@ -281,9 +293,11 @@ class SandSolids:
     def _whole_note(self, cuts: bool) -> str:
         """Return the reason why solids that cut cells are whole cells for the stresses."""
         reason = (
-            "some solids move"
-            if self.moves
+            "sand moves some of them"
+            if self._floats
             else "an axis is periodic"
+            if cuts and self._boundary.sides is not None
+            else "solids thinner than cells move"
             if cuts
             else 'solver.method is "interleaved-sweeps"'
         )
@@ -296,6 +310,8 @@ class SandSolids:
     def begin_step(self, time: float, dt: float) -> None:
         """Compute the solids' velocities in the step from `time` [s] of length `dt` [s]."""
         self._boundary.begin_step(time, dt)
+        if self.cut is not None and self.moves:
+            self.cut.find_velocity()
         if self.velocity:
             if self._middle is not None:
                 self._middle.assign(self._middles(time))
@@ -325,7 +341,7 @@ class SandSolids:
     def _launch_velocity(self) -> None:
         """Launch the update of the velocity of the solids' faces."""
         boundary, grid = self._boundary, self.grid
-        if self.moves and isinstance(boundary, CutBoundary):
+        if self.moves and self.cut is None and isinstance(boundary, CutBoundary):
             cut = boundary.cut
             for axis, field in enumerate(self.velocity):
                 inputs = [

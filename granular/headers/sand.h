@@ -44,7 +44,8 @@ auto light = [&](int d, long long o) {
 };
 
 // snippet openings: Solids that cut cells (CUT): open part of a cell's lower faces, and the part of
-// a cell that its differences along an axis stand for.
+// a cell that its differences along an axis stand for. CUT is 2 if some move: the last layer has the
+// rate at which their walls free space for the cell's sand, times dx / volume [m/s].
 #if CUT
 auto open = [&](int axis, long long i) INLINE { return (T)openings[axis * layer + i]; };
 auto counted = [&](int axis, long long i) INLINE { return (T)openings[(DIM + axis) * layer + i]; };
@@ -74,6 +75,9 @@ auto fullness = [](T free) INLINE {
 auto divergence = [&](long long i, T& diagonal) INLINE {
     const T full = fullness((T)drive[i] * (T)numbers[STEP_OF_CELL]);
     T w = (T)drive[i];
+#if CUT > 1
+    w += (T)openings[2 * DIM * layer + i];
+#endif
     UNROLL for (int axis = 0; axis < DIM; ++axis) {
         const long long o = i + s[axis];
         const T beyond = open(axis, o) * passes((T)mass[axis][o], full),

@@ -328,7 +328,8 @@ for (int m = first; m < end; ++m) {
 
 // kernel granular.stress.traction: Friction of the wall in a cell, within `wall_bound` of its load,
 // against the slip of the sand along the wall. The slip is the mean of the velocities of the cell's
-// faces, weighted by their open parts, without the part along the wall's normal n. A layer holds
+// faces, weighted by their open parts, relative to the wall's velocity if solids move (CUT = 2),
+// without the part along the wall's normal n. A layer holds
 // the traction times the wall's area over the open part of the cell's two faces along an axis; a
 // face takes this times its own open part. The load is the pressure, which alone keeps sand from
 // moving into the wall, and the weight of the part that no face of the cell stands for: of the
@@ -340,7 +341,7 @@ for (int m = first; m < end; ++m) {
 //   box        int32 cells, numbers_of
 //   numbers    int behind
 //   constants  COLUMNS, FRICTION, COHESION, WEIGHT, SHEAR_STEP, LOOKAHEAD, HOLDS, GAIN, RATIO,
-//              UNSURE, DIM, BOX = 0, RESIDUAL, NOW_S, NEXT_S
+//              UNSURE, DIM, BOX = 0, CUT, RESIDUAL, NOW_S, NEXT_S
 #include "sand.h:shape"
 #include "sand.h:wall_bound"
 const float* inverse[3] = XYZ(inverse);
@@ -353,8 +354,8 @@ double es = 0, ee = 0, ss = 0, residual = 0, work = 0;
 for (int m = first; m < last; ++m) {
     const long long cell = cells[m];
     if (!(flags[cell] & HOLDS)) continue;
-    // normal (3), area, part that faces leave out along each axis (3), volume
-    const float* n = walls + 8 * m;
+    // normal (3), area, part that faces leave out along each axis (3), volume, velocity (3)
+    const float* n = walls + (CUT > 1 ? 11 : 8) * m;
     const T size = n[3], x = now[cell];
     T v[DIM], sum[DIM], across = 0, stiffest = 0, load = x;
     int main = 0;
@@ -365,6 +366,9 @@ for (int m = first; m < last; ++m) {
         const T low = openings[a * layer + cell], high = openings[a * layer + o];
         sum[a] = low + high;
         v[a] = sum[a] > (T)0 ? (low * u[a][cell] + high * u[a][o]) / sum[a] : (T)0;
+#if CUT > 1
+        v[a] -= sum[a] > (T)0 ? (T)n[8 + a] : (T)0;
+#endif
         across += n[a] * v[a];
         load += n[a] * weight[a] * fraction[cell] * (alone ? n[7] : n[4 + a]) / size;
         if (sum[a] > (T)0) {

@@ -206,11 +206,12 @@ def bagnold(y: np.ndarray, depth: float, fall: float) -> np.ndarray:
     return np.asarray(2.0 / 3.0 * fall * (depth**1.5 - rest**1.5))
 
 
-@pytest.mark.parametrize(("tables", "kept"), [({"density_correction": {}}, 0.03), ({}, 0.08)])
-def test_a_layer_that_runs_for_long_keeps_its_height(tables: dict[str, Any], kept: float) -> None:
+@pytest.mark.parametrize("tables", [{"density_correction": {}}, {}])
+def test_a_layer_that_runs_for_long_keeps_its_height(tables: dict[str, Any]) -> None:
     """Height of glass beads that run down 26 degrees by mu(I), after 0.25 s.
 
-    Without a correction the layer packs to 0.86 of its mean height. The profile is Bagnold's, see
+    Where an axis is periodic, the table is the default. Without a correction the layer packs to
+    0.86 of its mean height. The profile is Bagnold's, see
     `warp_lcp.benchmarks.validation.inclined`.
     """
     depth, slope, static, dynamic, grain = 0.04, 26.0, 20.9, 32.76, 5.3e-4
@@ -242,8 +243,8 @@ def test_a_layer_that_runs_for_long_keeps_its_height(tables: dict[str, Any], kep
     while simulation.time < 0.25:
         simulation.step(min(simulation.stable_dt(), 5e-3))
     y, u = simulation.particles.position.numpy()[:, 1], simulation.particles.velocity.numpy()[:, 0]
-    assert y.mean() == pytest.approx(before, rel=kept)
-    assert u.mean() == pytest.approx(bagnold(y, depth, fall).mean(), rel=kept)
+    assert y.mean() == pytest.approx(before, rel=0.03)
+    assert u.mean() == pytest.approx(bagnold(y, depth, fall).mean(), rel=0.03)
     assert simulation.particles.count == 384
 
 

@@ -65,10 +65,10 @@ def test_old_names_mean_what_the_new_ones_mean(tmp_path):
         expected = load_scene(new)
     assert read.material == expected.material
     assert read.material.friction_angle_test == "plane-strain"
-    with pytest.warns(RenamedKeyWarning, match=r"material\.angle_of is now"):
+    with pytest.warns(RenamedKeyWarning, match=r"material\.angle_of = .* is now"):
         assert (
             load_scene(SCENE_TABLES, ["material.angle_of=repose"]).material.friction_angle_test
-            == "repose"
+            == "simple-shear"
         )
 
 
@@ -79,6 +79,27 @@ def test_fixed_text_keeps_all_else(form):
     assert text.replace("friction_angle_test", "angle_of") == FORMS[form]
     assert tomllib.loads(text)["scene"]["description"] == "angle_of repose"
     assert fix_text(text, SandScene, "heap.toml") == (text, [])
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_values_that_meant_something_else_are_fixed(form, tmp_path):
+    """`angle_of = "repose"` was the angle of layers, which is that of simple shear now."""
+    old = FORMS[form].replace('"plane-strain"', '"repose"')
+    text, renamed = fix_text(old, SandScene, "heap.toml")
+    assert renamed == [
+        'material.angle_of = "repose" is now material.friction_angle_test = "simple-shear"'
+    ]
+    assert text.replace("friction_angle_test", "angle_of") == old.replace(
+        '"repose"', '"simple-shear"'
+    )
+    assert fix_text(text, SandScene, "heap.toml") == (text, [])
+    # The value under the new name keeps its meaning.
+    new = SCENE.replace('angle_of = "plane-strain"', 'friction_angle_test = "repose"')
+    assert fix_text(new, SandScene, "heap.toml") == (new, [])
+    file = tmp_path / "heap.toml"
+    file.write_text(old)
+    with pytest.warns(RenamedKeyWarning, match=r'angle_of = "repose" is now .* "simple-shear"'):
+        assert load_scene(file).material.friction_angle_test == "simple-shear"
 
 
 def test_text_that_cannot_be_rewritten_is_refused():

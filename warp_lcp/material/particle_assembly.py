@@ -633,7 +633,7 @@ def make_density_monitor(
         boundary: its solids.
     """
     settings = scene.correction
-    if scene.density_correction is not None or settings is None:
+    if scene.corrects_steadily or settings is None:
         return None
     count = scene.particles.per_axis
     return DensityMonitor(

@@ -35,12 +35,13 @@ MOST_THIN = 1.02
 class ParticleRedistribution:
     """Particle redistribution: density correction and reseeding, when they are due.
 
-    Without the table [density_correction] a correction acts in steps that begin with more than the
-    fraction `ParticleScene.most_crowded` of the material in excess of what cells may hold. It
-    removes the excess over a time `PACE` sqrt(dx / g), so that a short step lifts little material.
-    The density is that at the start of the step, which the liquid's surface and the sand's packing
-    have computed already. Whether a step acts depends on the particles' positions only, so that a
-    checkpoint needs no more state. The fields of the correction are allocated when it first acts.
+    Without the table [density_correction], except where `ParticleScene.corrects_steadily`, a
+    correction acts in steps that begin with more than the fraction `ParticleScene.most_crowded` of
+    the material in excess of what cells may hold. It removes the excess over a time `PACE`
+    sqrt(dx / g), so that a short step lifts little material. The density is that at the start of
+    the step, which the liquid's surface and the sand's packing have computed already. Whether a
+    step acts depends on the particles' positions only, so that a checkpoint needs no more state.
+    The fields of the correction are allocated when it first acts.
 
     Moving solids may compress liquid much faster, such as a bottle that is shaken: where more
     than a fraction `SEVERE` is in excess (`SEVERE_THIN` where thin solids move), a correction
@@ -78,7 +79,7 @@ class ParticleRedistribution:
         self.correction: DensityCorrection | None = None
         settings = scene.correction
         self._every, self._most = settings.every if settings is not None else 0, scene.most_crowded
-        if scene.density_correction is not None and settings is not None:
+        if scene.corrects_steadily and settings is not None:
             self.correction = self._make_correction()
         g = math.hypot(*scene.physics.gravity)
         self._pace = PACE * math.sqrt(grid.spacing / g) if g > 0.0 else 0.0  # [s]

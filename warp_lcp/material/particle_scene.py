@@ -146,17 +146,20 @@ class ParticleScene(Scene):
         moving = [number for number, solid in enumerate(self.solid) if solid.moves]
         bodies = [number for number, solid in enumerate(self.solid) if solid.is_body]
         settings, output = self.particles, self.output
-        automatic = self.density_correction is None and self.correction is not None
+        corrects = self.correction is not None
+        steadily = corrects and self.corrects_steadily
         used = {
             "cut cells": _solids(range(len(self.solid))) if self.cuts_cells else "",
             "moving solids": _solids(moving) if moving else "",
             "rigid bodies": _solids(bodies) if bodies else "",
             "FLIP": 'particles.transfer = "flip"' if settings.transfer == "flip" else "",
-            "density correction": "[density_correction]"
-            if self.density_correction is not None and self.correction is not None
-            else "",
+            "density correction": ""
+            if not steadily
+            else "[density_correction]"
+            if self.density_correction is not None
+            else "sand is sheared for long",
             "automatic density correction": "particles are moved out of overfull cells"
-            if automatic
+            if corrects and not steadily
             else "",
             "reseeding": "[particles.reseed]" if settings.reseed is not None else "",
             "narrow band": "[particles.narrow_band]" if settings.narrow_band is not None else "",
@@ -184,6 +187,14 @@ class ParticleScene(Scene):
                 return None
             given = DensityCorrectionSettings(**preset_values(self, "density_correction"))
         return given if given.every else None
+
+    @property
+    def corrects_steadily(self) -> bool:
+        """Return whether each step of `correction.every` corrects the density.
+
+        Otherwise only steps that begin with overfull cells do, see `most_crowded`.
+        """
+        return self.density_correction is not None
 
     @property
     def most_crowded(self) -> float:
@@ -418,7 +429,7 @@ class ParticleScene(Scene):
             )
         if correction is not None:
             most, when = correction.largest(self.particles.per_axis), _steps(correction.every)
-            if self.density_correction is None:
+            if not self.corrects_steadily:
                 when += (
                     f" if more than {100.0 * self.most_crowded:.2g} % of the material exceeds it"
                 )

@@ -6,6 +6,7 @@ import re
 import tomllib
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -28,11 +29,9 @@ def rename_keys(tables: Tables, model: type[Table], source: str) -> None:
     Raises:
         SceneError: a table has a key by both names.
     """
-    for place, old, new in _rename(tables, model, source):
+    for change in _rename(tables, model, source):
         fix = f"; `warp-lcp check --fix {source}` rewrites it" if Path(source).is_file() else ""
-        warnings.warn(
-            f"{source}: {place}{old} is now {place}{new}{fix}", RenamedKeyWarning, stacklevel=3
-        )
+        warnings.warn(f"{source}: {change}{fix}", RenamedKeyWarning, stacklevel=3)
 
 
 def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]]:
@@ -51,29 +50,62 @@ def fix_text(text: str, model: type[Table], source: str) -> tuple[str, list[str]
     """
     expected = tomllib.loads(text)
     renamed = list(_rename(expected, model, source))
-    for old, new in {(old, new) for _, old, new in renamed}:
+    for change in {change.without_place() for change in renamed}:
         # Replaces `old = value`, also quoted, dotted or in an inline table.
+        key = rf"(?<![\w-]){change.old}(?=[\"']?\s*=)"
+        if change.values is not None:
+            before, after = change.values
+            text = re.sub(rf"({key}[\"']?\s*=\s*[\"']){before}(?=[\"'])", rf"\g<1>{after}", text)
+    for old, new in {(change.old, change.new) for change in renamed}:
         text = re.sub(rf"(?<![\w-]){old}(?=[\"']?\s*=)", new, text)
     if tomllib.loads(text) != expected:
-        raise SceneError(
-            source,
-            [
-                KeyFault(
-                    "",
-                    "rename by hand: "
-                    f"{'; '.join(f'{at}{old} to {at}{new}' for at, old, new in renamed)}",
-                )
-            ],
-        )
-    return text, [f"{place}{old} is now {place}{new}" for place, old, new in renamed]
+        by_hand = "; ".join(change.by_hand() for change in renamed)
+        raise SceneError(source, [KeyFault("", f"rename by hand: {by_hand}")])
+    return text, [str(change) for change in renamed]
 
 
-def _rename(
-    tables: Tables, model: type[Table], source: str, place: str = ""
-) -> Iterator[tuple[str, str, str]]:
-    """Rename keys of a table and the tables in it.
+@dataclass(frozen=True)
+class _Change:
+    """Change of a key to its current name.
 
-    Yields the place of each table, the old and the new name.
+    Attributes:
+        place: the table of the key, such as `material.`.
+        old: the old name.
+        new: the current name.
+        values: the value under the old name and the one that means the same today; None if the
+            value stays.
+    """
+
+    place: str
+    old: str
+    new: str
+    values: tuple[str, str] | None = None
+
+    def without_place(self) -> _Change:
+        """Return the change for a key in any table."""
+        return _Change("", self.old, self.new, self.values)
+
+    def by_hand(self) -> str:
+        """Return what to do, for a message."""
+        before, after = self._sides()
+        return f"{before} to {after}"
+
+    def __str__(self) -> str:
+        before, after = self._sides()
+        return f"{before} is now {after}"
+
+    def _sides(self) -> tuple[str, str]:
+        """Return the key before and after, with its value if that changes."""
+        old, new = f"{self.place}{self.old}", f"{self.place}{self.new}"
+        if self.values is None:
+            return old, new
+        return f'{old} = "{self.values[0]}"', f'{new} = "{self.values[1]}"'
+
+
+def _rename(tables: Tables, model: type[Table], source: str, place: str = "") -> Iterator[_Change]:
+    """Rename keys of a table and the tables in it, and yield the changes.
+
+    Values that meant something else under the old name are replaced, too.
     """
     for old, new in model.renamed.items():
         if old not in tables:
@@ -88,11 +120,18 @@ def _rename(
                     )
                 ],
             )
+        before = tables[old]
+        meanings = model.renamed_values.get(old, {})
+        after = meanings.get(before) if isinstance(before, str) else None
         # The order of keys is kept.
         entries = {new if key == old else key: value for key, value in tables.items()}
         tables.clear()
         tables.update(entries)
-        yield place, old, new
+        if not isinstance(before, str) or after is None:
+            yield _Change(place, old, new)
+            continue
+        tables[new] = after
+        yield _Change(place, old, new, (before, after))
     for name, field in model.model_fields.items():
         entry = tables.get(field.alias or name)
         rows = entry if isinstance(entry, list) else [entry]

@@ -75,6 +75,9 @@ class Table(BaseModel):
     #: Old names of keys, each with its current name; scene files may still have them (see
     #: `warp_lcp.scene.renamed_keys`).
     renamed: ClassVar[Mapping[str, str]] = {}
+    #: Values of a key with an old name that meant something else under it: the name, and for each
+    #: such value the one that means the same today.
+    renamed_values: ClassVar[Mapping[str, Mapping[str, str]]] = {}
 
 
 @dataclass(frozen=True)
