@@ -26,6 +26,7 @@ from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, ch
 from warp_lcp.benchmarks.validation.scenes import GRAVITY, box, create_sand
 from warp_lcp.files import Tables, TableValue
 from warp_lcp.granular.simulator import SandSimulation
+from warp_lcp.grid.staggered import Window
 
 RESOLUTIONS = {2: (16, 24), 3: (16,)}  # cells of the width, by dimension
 SLOT = 4  # cells along the periodic axis z
@@ -303,9 +304,13 @@ def _drive(
     packing, rate = simulation.packing, simulation.grid.spacing / dt
 
     def update(
-        density: wp.array, velocity: Sequence[wp.array], dt: float, solid: Sequence[wp.array] = ()
+        density: wp.array,
+        velocity: Sequence[wp.array],
+        dt: float,
+        solid: Sequence[wp.array] = (),
+        window: Window | None = None,
     ) -> None:
-        type(packing).update(packing, density, velocity, dt, solid)
+        type(packing).update(packing, density, velocity, dt, solid, window)
         new = rule(packing.fraction.numpy(), packing.drive.numpy() / rate)
         packing.drive.assign((new * rate).astype(np.float32))
 
