@@ -14,10 +14,10 @@ FAR = 2.0  # lattice cells: beyond this distance a solid does not reduce the liq
 # Share of a kernel. Where less is open, the distance is extrapolated from outside the solid.
 LEAST_OPEN = 0.25
 # A particle is amplified by gain (sqrt(THIN / fullness) - 1) where the fullness around it, see the
-# kernel `boost`, is below THIN: not at a plane surface, where the outermost particles have 0.9 to 1;
-# most in a drop of one particle, which has its own kernel alone; by 0.6 in a sheet of one layer,
-# which has 0.26, and by 0.15 in one of two layers, so that they keep their thickness.
-THIN = 0.95
+# kernel `boost`, is below THIN. For a kernel of 1.5 particle distances the fullness is 0.9 to 1.0
+# up to half a particle distance below a plane surface, 0.6 in a sheet of two layers, 0.27 in
+# one of one layer, and that of its own kernel, 0.02, in a drop of one particle.
+THIN = 1.0
 # Share of a particle's lattice cell from which on the fullness at the particle is not below THIN.
 CROWDED = 0.8
 
