@@ -1,7 +1,7 @@
 """Surfaces for films: this program's beside pysplashsurf's.
 
-Run `python -m benchmarks.surfaces [--seed N] [--frames FOLDER] [--picture FILE]` in the source tree,
-for pysplashsurf after `pip install pysplashsurf`.
+Run `python -m benchmarks.surfaces [--seed N] [--frames FOLDER] [--picture FILE]` in the source
+tree, for pysplashsurf after `pip install pysplashsurf`.
 
 Three liquids are simulated in 3-D and stored 24 times a second: a dam that breaks over a pillar, a
 drop that falls into a pool, and a sheet that is poured. Both programs wrap the same particles. The
@@ -75,7 +75,7 @@ class FilmScene:
         Args:
             seed: seed of the particles' places.
         """
-        data = {
+        data: Tables = {
             "scene": {"simulator": "fluids"},
             "time": {"duration": 10.0, "frames_per_second": RATE},
             "domain": {"size": list(self.size), "resolution": self.resolution, "wall": self.wall},
@@ -191,13 +191,15 @@ def splashsurf(scene: FilmScene, *, length: float, threshold: float) -> Wrap:
     return wrap
 
 
-OURS = {
+Method = Callable[[FilmScene], Wrap]
+
+OURS: dict[str, Method] = {
     "this program": ours,
     "smoothing 2": functools.partial(ours, smoothing=2.0),
     "resolution 4": functools.partial(ours, resolution=4),
 }
 # The length and the threshold of its manual, then those that suit particles of this program.
-SPLASHSURF = {
+SPLASHSURF: dict[str, Method] = {
     f"pysplashsurf {length:g}, {threshold:g}": functools.partial(
         splashsurf, length=length, threshold=threshold
     )
@@ -205,7 +207,7 @@ SPLASHSURF = {
 }
 
 
-def methods() -> dict[str, Callable[[FilmScene], Wrap]]:
+def methods() -> dict[str, Method]:
     """Return the methods by name; pysplashsurf's if it is installed."""
     try:
         splashsurf(REST, length=2.0, threshold=0.6)
@@ -297,7 +299,7 @@ def beads(wrap: Wrap, x: np.ndarray) -> dict[str, float]:
     return {"pool": float(heights.std()), "ball": float(radii.std())}
 
 
-def flicker(make: Callable[[FilmScene], Wrap], films: Mapping[str, Film]) -> dict[str, float]:
+def flicker(make: Method, films: Mapping[str, Film]) -> dict[str, float]:
     """Return the RMS change [cells] of a pool at rest and of one that a current moves."""
     wrap, cell = make(REST), REST.spacing
     meshes = [wrap(x) for x in films["rest"].values()]
@@ -321,7 +323,7 @@ def rms(values: Sequence[float]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def cost(make: Callable[[FilmScene], Wrap], scene: FilmScene, x: np.ndarray) -> tuple[float, float]:
+def cost(make: Method, scene: FilmScene, x: np.ndarray) -> tuple[float, float]:
     """Return CPU seconds and MB of a frame."""
     make(scene)(x)  # loads kernels
     forget_peak()
@@ -347,7 +349,8 @@ def films(folder: Path | None, seed: int) -> dict[str, Film]:
         found[name] = scene.particles(seed)
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path, **{str(frame): x for frame, x in found[name].items()})
+            arrays = {str(frame): x for frame, x in found[name].items()}
+            np.savez(path, **arrays)  # type: ignore[arg-type]
     return found
 
 
@@ -394,7 +397,10 @@ def picture(particles: Mapping[str, Film], path: Path) -> None:
         "dam break": ((2.6, 1.15, 2.2), (0.95, 0.25, 0.4)),
         "poured sheet": ((1.5, 0.9, 1.9), (0.3, 0.55, 0.3)),
     }
-    shown = {"this program": ours, "pysplashsurf 3, 0.5": SPLASHSURF["pysplashsurf 3, 0.5"]}
+    shown: dict[str, Method] = {
+        "this program": ours,
+        "pysplashsurf 3, 0.5": SPLASHSURF["pysplashsurf 3, 0.5"],
+    }
     plotter = pyvista.Plotter(off_screen=True, shape=(1, 4), window_size=(1840, 460), border=False)
     views = [(name, title) for name in cameras for title in shown]
     for column, (name, title) in enumerate(views):

@@ -57,7 +57,7 @@ for (long long p = first; p < last; ++p) {
     const int i = cell(0, nx), j = cell(1, ny), k = planes == 2 ? cell(2, nz) : 1;
     const long long at = k * s1 + j * s2 + i;
     if (smooth[at] >= (T)CROWDED * (capacity ? open_share(capacity[at]) : (T)1)) continue;
-    T wx[3], wy[3], wz[3] = {0, 1, 0}, dx_[3], dy_[3], dz_[3] = {0, 0, 0};
+    T wx[3], wy[3], wz[3] = {0, 1, 0}, gx[3], gy[3], gz[3] = {0, 0, 0};
     // Weights of a quadratic B-spline along an axis, and their derivatives: with a = sqrt(2 w[0])
     // and b = sqrt(2 w[2]) = 1 - a these are -a, a - b, b.
     auto along = [&](int axis, int n, T* w, T* d) {
@@ -66,9 +66,9 @@ for (long long p = first; p < last; ++p) {
         d[0] = d[2] - 1;
         d[1] = -d[0] - d[2];
     };
-    along(0, nx, wx, dx_);
-    along(1, ny, wy, dy_);
-    if (planes == 2) along(2, nz, wz, dz_);
+    along(0, nx, wx, gx);
+    along(1, ny, wy, gy);
+    if (planes == 2) along(2, nz, wz, gz);
     auto each_node = [&](auto visit) {
         for (int c = 2 - planes; c <= planes; ++c)
             for (int b = 0; b < 3; ++b)
@@ -79,9 +79,9 @@ for (long long p = first; p < last; ++p) {
         each_node([&](long long node, int c, int b, int a) {
             const T f = field[node];
             value += f * (wz[c] * wy[b] * wx[a]);
-            slope[0] += f * (wz[c] * wy[b] * dx_[a]);
-            slope[1] += f * (wz[c] * dy_[b] * wx[a]);
-            slope[2] += f * (dz_[c] * wy[b] * wx[a]);
+            slope[0] += f * (wz[c] * wy[b] * gx[a]);
+            slope[1] += f * (wz[c] * gy[b] * wx[a]);
+            slope[2] += f * (gz[c] * wy[b] * wx[a]);
         });
     };
     T share = 0, slope[3] = {0, 0, 0};
