@@ -72,7 +72,8 @@ for (long long p = first; p < last; ++p) {
     auto each_node = [&](auto visit) {
         for (int c = 2 - planes; c <= planes; ++c)
             for (int b = 0; b < 3; ++b)
-                for (int a = 0; a < 3; ++a) visit(at + (c - 1) * s1 + (b - 1) * s2 + a - 1, c, b, a);
+                for (int a = 0; a < 3; ++a)
+                    visit(at + (c - 1) * s1 + (b - 1) * s2 + a - 1, c, b, a);
     };
     // The field and its gradient at the particle.
     auto sample = [&](const float* field, T& value, T* slope) {
