@@ -8,6 +8,7 @@ import itertools
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial import cKDTree
 
 from mesh_checks import assert_closed, enclosed, pieces
 from warp_lcp.grid.level_set import LevelSet
@@ -90,7 +91,7 @@ def test_a_pool_is_flat_and_its_walls_too(grid, smoothing):
     walls = np.min([np.minimum(points[:, a], size[a] - points[:, a]) for a in axes], axis=0) < 1e-4
     top = points[~walls & (points[:, 1] > 10.0), 1]
     assert len(top) >= 50
-    assert top.mean() == pytest.approx(14.0, abs=0.01)
+    assert top.mean() == pytest.approx(14.0, abs=0.015)
     assert top.std() < 0.02
     assert np.abs(top - 14.0).max() < 0.12  # the last row of points before a wall leans to it
     assert walls.sum() + len(top) == len(points)
@@ -145,6 +146,42 @@ def test_a_sheet_of_one_layer_has_no_holes(smoothing):
     # Euler characteristic of a sphere; each hole would take 2
     assert len(points) - len(corners) / 2 == 2
     assert enclosed(points, corners) == pytest.approx(len(x) / 8.0, rel=0.35)
+
+
+@pytest.mark.parametrize("layers", [1, 2])
+def test_an_uneven_sheet_keeps_its_volume_and_has_no_holes(layers):
+    """Sheet of one or two layers whose particles lie up to a quarter of their distance astray."""
+    rng = np.random.default_rng(SEED + layers)
+    side = 0.5 * np.arange(8, 48)
+    x = np.stack(np.meshgrid(side, 15.2 + 0.5 * np.arange(layers), side), axis=-1).reshape(-1, 3)
+    x += 0.25 * (rng.random(x.shape) - 0.5)
+    points, corners = surface_of(DEEP, x * DX)
+    assert pieces(points, corners) == 1
+    assert len(points) - len(corners) / 2 == 2
+    assert enclosed(points, corners) == pytest.approx(len(x) / 8.0, rel=0.2)
+
+
+def test_beads_and_flicker_of_irregular_particles_are_small():
+    """Ball of particles at random places in cells, moved by parts of a cell.
+
+    The radius has the noise of the particles. A move changes a fraction of it: beads do not
+    depend on where the lattice is.
+    """
+    center, radius = np.array([14.1, 15.3, 14.6]), 9.0
+    x = fill(DEEP, lambda p: np.linalg.norm(p - center, axis=1) < radius, jitter=0.5)
+    first = None
+    for move in np.outer(range(3), (0.37, 0.11, 0.21)):
+        points, _ = surface_of(DEEP, x + move * DX)
+        points -= move
+        radii = np.linalg.norm(points - center, axis=1)
+        assert radii.std() < 0.06
+        assert radii.mean() == pytest.approx(radius, abs=0.08)
+        if first is None:
+            first = points
+            continue
+        nearest = cKDTree(points).query(first)[1]
+        change = np.linalg.norm(first - center, axis=1) - radii[nearest]
+        assert np.sqrt((change**2).mean()) < 0.015
 
 
 def cylinder(x):
@@ -229,7 +266,7 @@ def test_an_interior_without_particles_is_full():
 def test_resolution_refines_and_coarsens(grid):
     x = fill(grid, lambda p: ((p > 6.0) & (p < 18.0))[:, : grid.dimension].all(axis=1), jitter=0.0)
     counts = []
-    for resolution, accuracy in ((1, 0.06), (2, 0.02), (4, 0.02)):
+    for resolution, accuracy in ((1, 0.06), (2, 0.03), (4, 0.03)):
         points, corners = surface_of(grid, x, resolution=resolution)
         assert enclosed(points, corners) == pytest.approx(12.0**grid.dimension, rel=accuracy)
         counts.append(len(corners))

@@ -32,6 +32,10 @@ EXTENDED = 2  # layers to which the distance is extrapolated into solids, and th
 # Largest smoothed share that a lone particle is assumed to have. Kernels as narrow as particles
 # cannot distinguish it from others.
 CROWD = 0.1
+# A layer of evenly spread particles keeps its thickness if its narrow kernels are amplified by
+# 1 - 2 s, with s the smoothed share in it. Uneven particles need more, or there are holes.
+UNEVEN = 1.6
+SAMPLED = 0.25  # variance that interpolation by quadratic B-splines adds [lattice cells^2]
 # Rounds of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume.
 ROUNDS = 3
 SEEN = 2 * ROUNDS + 1  # lattice cells around a cell that its smoothed points depend on
@@ -95,10 +99,10 @@ class SurfaceMesh:
     `smoothing` particle distances, and divided by the open part of the kernel beside solids and
     walls: the filled share. The surface is where this share is 1/2. It is unbiased for a plane, and
     flat at walls that the plane meets at a right angle; a ball of radius R shrinks by up to
-    smoothing^2 / R [particle distances]. Where particles have few others around them, in drops,
-    filaments and sheets too thin for the kernel, a narrow kernel is added to the share. Its weight
-    grows as the smoothed share falls, so that a drop of one particle remains. The surface is cut
-    along walls, solids and the domain's sides, open and periodic ones included.
+    smoothing^2 / R [particle distances]. In drops, filaments and sheets too thin for the kernel,
+    narrow kernels of the particles are added to the share. Their weight grows as the fullness
+    falls, see the kernel `boost`, so that a drop of one particle remains. The surface is cut along
+    walls, solids and the domain's sides, open and periodic ones included.
 
     Args:
         grid: the grid.
@@ -143,9 +147,15 @@ class SurfaceMesh:
         # That value is scaled to the share 1/2.
         self._most = 2.0 ** (grid.dimension - 1)
         alone = min(
-            self._each * (2.0 * math.pi * self._spread**2) ** (-0.5 * grid.dimension), CROWD
+            self._each * (2.0 * math.pi * (self._spread**2 + SAMPLED)) ** (-0.5 * grid.dimension),
+            CROWD,
         )
-        self._gain = self._most / ((kernels.THIN / alone) ** kernels.POWER - 1.0)
+        # Smoothed share in a sheet of one layer.
+        layer = min(distance / (math.sqrt(2.0 * math.pi) * self._spread), 0.5)
+        self._gain = max(
+            self._most / (math.sqrt(kernels.THIN / alone) - 1.0),
+            UNEVEN * (1.0 - 2.0 * layer) / (math.sqrt(kernels.THIN / layer) - 1.0),
+        )
         self._fields = [self.lattice.field() for _ in range(3)]
         self._room = self.lattice.field() if obstacles else None
         self._capacity = self.lattice.field() if obstacles else None
@@ -203,6 +213,7 @@ class SurfaceMesh:
             thin=thin,
             gain=self._gain,
             most=self._most,
+            spread=math.sqrt(self._spread**2 + SAMPLED),
         )
         self._mirror(thin, fold=True)
         if self._thin_passes:

@@ -13,10 +13,13 @@ from warp_lcp.operators.grid_poisson import SOLID
 FAR = 2.0  # lattice cells: beyond this distance a solid does not reduce the liquid
 # Share of a kernel. Where less is open, the distance is extrapolated from outside the solid.
 LEAST_OPEN = 0.25
-# A particle is amplified by gain ((THIN / share)^POWER - 1) where the smoothed share is below THIN:
-# not at a plane surface, where the outermost particles have about 0.63; most in a drop of one
-# particle; by about 1/2 in a sheet of one layer, which keeps its thickness.
-THIN, POWER = 0.6, 0.4
+# A particle is amplified by gain (sqrt(THIN / fullness) - 1) where the fullness around it, see the
+# kernel `boost`, is below THIN. For a kernel of 1.5 particle distances the fullness is 0.9 to 1.0
+# up to half a particle distance below a plane surface, 0.6 in a sheet of two layers, 0.27 in
+# one of one layer, and that of its own kernel, 0.02, in a drop of one particle.
+THIN = 1.0
+# Share of a particle's lattice cell from which on the fullness at the particle is not below THIN.
+CROWDED = 0.8
 
 
 _options = {"module": "warp_lcp.grid.surface_mesh"}
@@ -24,7 +27,7 @@ _options = {"module": "warp_lcp.grid.surface_mesh"}
 
 KERNELS = KernelFile(
     Path(__file__).parent / "headers/surface_mesh.h",
-    {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "POWER": POWER},
+    {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "CROWDED": CROWDED},
 )
 DISTANCE = KERNELS["warp_lcp.grid.surface_mesh.surface_distance"]
 ROOM = KERNELS["warp_lcp.grid.surface_mesh.room"]

@@ -28,15 +28,18 @@ for (int i = first; i < last; ++i) {
     out[i] = scale * (low + fz * (high - low));
 }
 
-// kernel warp_lcp.grid.surface_mesh.boost: Add to the kernels of particles that have few others
-// around them: the fewer, the more. The share in the particle's own lattice cell decides, so that
-// most particles end here.
+// kernel warp_lcp.grid.surface_mesh.boost: Add to the kernels of particles in thin material: the
+// thinner, the more, by gain (sqrt(THIN / fullness) - 1) if fullness < THIN. The fullness at a
+// particle is share + spread |grad share|, from the smoothed share. At a plane surface the gradient
+// makes up for the missing half; in the middle of a sheet, a filament or a drop it is 0. Share and
+// gradient are interpolated, so that the surface does not depend on where the particles lie between
+// the lattice's nodes. Most particles end at the share of their own lattice cell, CROWDED.
 //   compute    float32
 //   whole      float32 smooth, capacity?, thin
 //   box        vec3 position
 //   numbers    int planes; float32 dx, inverse_dx; int before_x, before_y, before_z; float32 each,
-//              gain, most
-//   constants  LEAST_OPEN, THIN, POWER
+//              gain, most, spread
+//   constants  LEAST_OPEN, THIN, CROWDED
 //   ordered
 #include "particles.h:origin"
 #include "particles.h:weigh"
@@ -44,6 +47,7 @@ for (int i = first; i < last; ++i) {
 const T* position = (const T*)given.position.data;
 const int nx = given.thin.shape[2] - 2, ny = given.thin.shape[1] - 2, nz = given.thin.shape[0] - 2;
 const long long s2 = nx + 2, s1 = s2 * (ny + 2);
+auto open_share = [&](T open) { return open > (T)LEAST_OPEN ? open : (T)LEAST_OPEN; };
 for (long long p = first; p < last; ++p) {
     auto cell = [&](int axis, int n) {
         const T x = grid_coordinate(position[3 * p + axis], origin[axis]), from = x > 1 ? x : (T)1,
@@ -52,19 +56,52 @@ for (long long p = first; p < last; ++p) {
     };
     const int i = cell(0, nx), j = cell(1, ny), k = planes == 2 ? cell(2, nz) : 1;
     const long long at = k * s1 + j * s2 + i;
-    T share = smooth[at];
-    if (capacity) share /= capacity[at] > (T)LEAST_OPEN ? capacity[at] : (T)LEAST_OPEN;
-    if (share >= (T)THIN) continue;
-    const T wanted = gain * ((T)pow((T)THIN / (share > (T)1e-3 ? share : (T)1e-3), (T)POWER) - 1);
+    if (smooth[at] >= (T)CROWDED * (capacity ? open_share(capacity[at]) : (T)1)) continue;
+    T wx[3], wy[3], wz[3] = {0, 1, 0}, gx[3], gy[3], gz[3] = {0, 0, 0};
+    // Weights of a quadratic B-spline along an axis, and their derivatives: with a = sqrt(2 w[0])
+    // and b = sqrt(2 w[2]) = 1 - a these are -a, a - b, b.
+    auto along = [&](int axis, int n, T* w, T* d) {
+        weigh(grid_coordinate(position[3 * p + axis], origin[axis]), n, w);
+        d[2] = w[2] - w[0] + (T)0.5;
+        d[0] = d[2] - 1;
+        d[1] = -d[0] - d[2];
+    };
+    along(0, nx, wx, gx);
+    along(1, ny, wy, gy);
+    if (planes == 2) along(2, nz, wz, gz);
+    auto each_node = [&](auto visit) {
+        for (int c = 2 - planes; c <= planes; ++c)
+            for (int b = 0; b < 3; ++b)
+                for (int a = 0; a < 3; ++a)
+                    visit(at + (c - 1) * s1 + (b - 1) * s2 + a - 1, c, b, a);
+    };
+    // The field and its gradient at the particle.
+    auto sample = [&](const float* field, T& value, T* slope) {
+        each_node([&](long long node, int c, int b, int a) {
+            const T f = field[node];
+            value += f * (wz[c] * wy[b] * wx[a]);
+            slope[0] += f * (wz[c] * wy[b] * gx[a]);
+            slope[1] += f * (wz[c] * gy[b] * wx[a]);
+            slope[2] += f * (gz[c] * wy[b] * wx[a]);
+        });
+    };
+    T share = 0, slope[3] = {0, 0, 0};
+    sample(smooth, share, slope);
+    if (capacity) {
+        T open = 0, narrower[3] = {0, 0, 0};
+        sample(capacity, open, narrower);
+        open = open_share(open);
+        share /= open;
+        for (int a = 0; a < 3; ++a) slope[a] = (slope[a] - share * narrower[a]) / open;
+    }
+    const T steep = slope[0] * slope[0] + slope[1] * slope[1] + slope[2] * slope[2];
+    const T fullness = share + spread * sqrt(steep);
+    if (fullness >= (T)THIN) continue;
+    const T wanted = gain * (sqrt((T)THIN / (fullness > (T)1e-3 ? fullness : (T)1e-3)) - 1);
     const T boost = each * (wanted < most ? wanted : most);
-    T wx[3], wy[3], wz[3] = {0, 1, 0};
-    weigh(grid_coordinate(position[3 * p], origin[0]), nx, wx);
-    weigh(grid_coordinate(position[3 * p + 1], origin[1]), ny, wy);
-    if (planes == 2) weigh(grid_coordinate(position[3 * p + 2], origin[2]), nz, wz);
-    for (int c = 2 - planes; c <= planes; ++c)
-        for (int b = 0; b < 3; ++b)
-            for (int a = 0; a < 3; ++a)
-                add(thin[at + (c - 1) * s1 + (b - 1) * s2 + a - 1], boost * wz[c] * wy[b] * wx[a]);
+    each_node([&](long long node, int c, int b, int a) {
+        add(thin[node], boost * (wz[c] * wy[b] * wx[a]));
+    });
 }
 
 // kernel warp_lcp.grid.surface_mesh.carve: Remove the inside of solids from the liquid: phi =
