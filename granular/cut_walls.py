@@ -208,7 +208,7 @@ class CutWalls:
         cells = np.ravel_multi_index((k + begins[0], j + begins[1], i + begins[2]), grid.shape)
         self._list(here, _Walls(cells.astype(np.int64), found.numbers, found.entries))
 
-    def _list(self, box: tuple[slice, slice, slice], found: _Walls) -> None:
+    def _list(self, box: tuple[slice, ...], found: _Walls) -> None:
         """Replace the walls of the cells in a box by other ones."""
         inside = np.zeros(self.grid.shape, dtype=bool)
         inside[box] = True
