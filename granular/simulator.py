@@ -629,7 +629,7 @@ class SandSimulation(ParticleSimulation):
 
     def _own(self, field: wp.array) -> np.ndarray:
         """Return the part of a field that only this process has."""
-        return np.asarray(self.grid.part.stored_view(field.numpy()))
+        return np.asarray(self.grid.part.known_of(field.numpy()))
 
     def _largest(self, values: list[float]) -> list[float]:
         """Return the elementwise maximum over all processes."""

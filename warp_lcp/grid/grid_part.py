@@ -423,7 +423,7 @@ class GridPart:
         """Processes that share rows along x, in order; None if rows are whole."""
         return None
 
-    def stored_view(self, field: np.ndarray) -> np.ndarray:
+    def known_of(self, field: np.ndarray) -> np.ndarray:
         """Return the view of a host field on the cells that only this process stores."""
         return field
 
