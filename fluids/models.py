@@ -130,7 +130,7 @@ def whitewater_reach(scene: LiquidScene) -> tuple[str, float] | None:
     if scene.whitewater is None or not scene.has_whitewater:
         return None
     settings = scene.whitewater.resolved(
-        longest=max(scene.domain.size),
+        longest=None if scene.domain.boundless else max(scene.domain.size),
         spacing=scene.spacing,
         gravity=scene.physics.gravity,
         dimension=scene.dimension,

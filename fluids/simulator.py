@@ -420,7 +420,10 @@ class LiquidSimulation(ParticleSimulation):
         super()._take_clock(state)
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
-        """Continue from the pieces of all ranks of a run, with their whitewater; collective."""
+        """Continue from the pieces of all ranks of a run; collective.
+
+        Whitewater continues too.
+        """
         super().restore_pieces(pieces)
         if self.whitewater is not None and self.grid.part.shared:
             self.whitewater.restore_pieces(pieces)
