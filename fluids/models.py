@@ -122,6 +122,23 @@ def make_whitewater(scene: LiquidScene, grid: StaggeredGrid) -> Whitewater | Non
     return Whitewater(scene, grid)
 
 
+def whitewater_reach(scene: LiquidScene) -> tuple[str, float] | None:
+    """Return the key and the distance [m] at which whitewater reads the liquid.
+
+    None without whitewater.
+    """
+    if scene.whitewater is None or not scene.has_whitewater:
+        return None
+    settings = scene.whitewater.resolved(
+        longest=None if scene.domain.boundless else max(scene.domain.size),
+        spacing=scene.spacing,
+        gravity=scene.physics.gravity,
+        dimension=scene.dimension,
+    )
+    assert settings.length is not None
+    return "whitewater.length", settings.length
+
+
 def make_pressure(
     scene: LiquidScene,
     grid: StaggeredGrid,

@@ -19,6 +19,7 @@ from warp_lcp.fluids.models import (
     make_tension,
     make_viscosity,
     make_whitewater,
+    whitewater_reach,
 )
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
@@ -55,6 +56,8 @@ from warp_lcp.simulation import Cells, Part, SimulationFailed, missed_by_far
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.ranks import Ranks
+    from warp_lcp.distributed.subdomain import Subdomain
+    from warp_lcp.material.particle_pieces import Piece
 
 
 # Methods that solve on several ranks.
@@ -408,10 +411,28 @@ class LiquidSimulation(ParticleSimulation):
         return super().state() | ({} if self.whitewater is None else self.whitewater.state())
 
     def _take_clock(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue with the time, the bodies and the whitewater of a state."""
-        if self.whitewater is not None:
+        """Continue with the time, the bodies and the whitewater of a state.
+
+        On ranks, pieces have the whitewater, see `restore_pieces`.
+        """
+        if self.whitewater is not None and not self.grid.part.shared:
             self.whitewater.restore(state)
         super()._take_clock(state)
+
+    def restore_pieces(self, pieces: Sequence[Piece]) -> None:
+        """Continue from the pieces of all ranks of a run; collective.
+
+        Whitewater continues too.
+        """
+        super().restore_pieces(pieces)
+        if self.whitewater is not None and self.grid.part.shared:
+            self.whitewater.restore_pieces(pieces)
+
+    def repartition(self, part: Subdomain) -> None:
+        """Continue in other boxes of the same ranks, with the whitewater; collective."""
+        super().repartition(part)
+        if self.whitewater is not None:
+            self.whitewater.migrate()
 
     def _find_surface(self, window: Window) -> None:
         """Mark liquid cells, set their face velocities, and apply surface tension."""
@@ -780,8 +801,8 @@ class FluidsSimulator:
                     ranks,
                     device,
                     methods=METHODS_ON_RANKS,
-                    refused=() if scene.whitewater is None else ("whitewater",),
                     smoothing=scene.pressure.smoothing,
+                    reach=whitewater_reach(scene),
                 ).grid,
             )
         parts = make_parts(grid)

@@ -4,11 +4,14 @@ After a step, each liquid cell emits particles at a rate per volume where liquid
 per area at wave crests; both rates grow with the kinetic energy. Velocities and the surface are
 compared over a fixed length, by random points of the cells, so the amount depends neither on the
 cells nor on the steps. The particles do not act on the liquid.
+
+On ranks, each rank emits in the cells of its box and moves the particles in it. The ghost layers
+reach as far as the compared points. After a step each particle goes to the rank of its cell.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +19,7 @@ import warp as wp
 
 from warp_lcp.fluids import whitewater_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list, scan
+from warp_lcp.grid.grid_part import ParticleExchange, subdomain_of
 from warp_lcp.grid.particle_loops import MARGIN, PARTICLE
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -23,6 +27,7 @@ from warp_lcp.kernels.launch_graph import clear
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_log import Row
+from warp_lcp.material.particle_pieces import PASSIVE, Piece
 from warp_lcp.simulation import Points
 
 if TYPE_CHECKING:
@@ -36,11 +41,7 @@ SAMPLE_SPACING = 0.6  # mean distance of sampled cells in a step, relative to `l
 KINDS = ("spray", "foam", "bubbles")  # of the log's columns, in the order of the kernels' numbers
 COLUMNS = (*(f"whitewater_{kind}" for kind in KINDS), "whitewater_removed")
 # Names of the particles' arrays in a checkpoint; `kept` is age, life [s] and kind.
-STATE = {
-    "whitewater_position": "position",
-    "whitewater_velocity": "velocity",
-    "whitewater_state": "kept",
-}
+STATE = dict(zip(PASSIVE, ("position", "velocity", "kept"), strict=True))
 
 
 def directions(dimension: int) -> np.ndarray:
@@ -65,7 +66,9 @@ def directions(dimension: int) -> np.ndarray:
 class Whitewater:
     """Diffuse particles of a liquid, and their emission.
 
-    The arrays of a grid are set by `allocate`; the particles stay if the grid changes.
+    The arrays of a grid are set by `allocate`; the particles stay if the grid changes. On ranks the
+    particles are those in this rank's box, and `advance`, `migrate` and `restore_pieces` are
+    collective.
 
     Args:
         scene: a scene with the table [whitewater].
@@ -73,7 +76,7 @@ class Whitewater:
 
     Attributes:
         particles: position [m], velocity [m/s], and age, rest of the life [s] and kind in `kept`.
-            The oldest come first.
+            In one process the oldest come first.
         settings: of the scene, with values for all defaults.
     """
 
@@ -92,9 +95,11 @@ class Whitewater:
         self.particles = Particles(
             grid, nothing, nothing, affine=False, kept=nothing[:, 0], indexed=False
         )
+        # These particles have no ghosts and no order of sums: `migrate` sends them to their ranks.
+        self.particles.exchange = ParticleExchange(self.particles)
         self._directions = wp.array(directions(grid.dimension), dtype=wp.vec3, device=grid.device)
         self._counts = DeviceScalar(grid.device, len(KINDS), wp.int32)
-        self.removed = 0  # in the last step, because there were too many
+        self.removed = 0  # in the last step on all ranks, because there were too many
 
     def allocate(self, grid: StaggeredGrid) -> None:
         """Allocate the fields of a grid: its liquid, and numbers of new particles."""
@@ -115,7 +120,7 @@ class Whitewater:
             dt: time step [s].
 
         Returns:
-            The values of `COLUMNS`.
+            The values of `COLUMNS`, of all ranks.
         """
         fields = self._fields(liquid, window)
         self._emit(fields, window, liquid.step_count, dt)
@@ -130,8 +135,18 @@ class Whitewater:
             particles.finish_removal(particles.marks)
             if liquid.outlets is not None:
                 liquid.outlets.apply(particles, liquid.time - dt, liquid.time)
+        self.migrate()
         self._limit()
         return self._row()
+
+    def migrate(self) -> None:
+        """Send particles to the ranks that own their cells; collective."""
+        if not self.grid.part.shared:
+            return
+        arrays = {name: array.numpy() for name, array in self.particles.arrays().items()}
+        migrated = subdomain_of(self.grid).send_to_owners(arrays)
+        if migrated is not None:
+            self.particles.assign(migrated)
 
     def points(self) -> Points:
         """Return the particles for a frame: velocity [m/s], kind (0 to 2, as `KINDS`), age [s]."""
@@ -173,6 +188,15 @@ class Whitewater:
                 )
         self.particles.assign(arrays)
 
+    def restore_pieces(self, pieces: Sequence[Piece]) -> None:
+        """Continue from the particles of all ranks' pieces in this rank's box; collective.
+
+        Raises:
+            ValueError: as of `restore`; on all ranks.
+        """
+        found = subdomain_of(self.grid).rows_of_pieces(pieces, list(STATE))
+        self.particles.assign({own: found[name] for name, own in STATE.items()})
+
     def _fields(self, liquid: LiquidSimulation, window: Window) -> kernels.LiquidFields:
         """Return the liquid's fields as kernels take them."""
         grid, boundary, fields = self.grid, liquid.boundary, kernels.LiquidFields()
@@ -180,6 +204,8 @@ class Whitewater:
         assert phi is not None, "whitewater needs a level set"
         clear(self._centers)
         # In 2-D the third component is not read.
+        # Later models of the step may have left other values in ghost cells.
+        grid.part.fill(*velocity, phi)
         components = [velocity[0], velocity[1], velocity[-1]]
         window.launch(kernels.center_kernel, [grid.planes, *components, phi, self._centers])
         fields.planes, fields.dx = grid.planes, grid.spacing
@@ -232,9 +258,12 @@ class Whitewater:
 
     def _emit(self, fields: kernels.LiquidFields, window: Window, step: int, dt: float) -> None:
         """Add the new particles of a step, in the order of cells."""
+        own = self.grid.part.near(window, 0)  # other ranks emit in their own cells
+        if own is None:
+            return
         numbers, ends = self._emission(step, dt), self._ends
         clear(ends)
-        window.launch(kernels.count_kernel, [fields, numbers, ends])
+        own.launch(kernels.count_kernel, [fields, numbers, ends])
         flat = ends.flatten()
         scan(flat, flat, inclusive=True)
         new = int(flat[-1:].numpy()[0])
@@ -242,7 +271,7 @@ class Whitewater:
             return
         old = self.particles.make_room(new)
         arrays = self.particles.arrays()
-        window.launch(kernels.emit_kernel, [fields, numbers, ends, old, *arrays.values()])
+        own.launch(kernels.emit_kernel, [fields, numbers, ends, old, *arrays.values()])
 
     def _move(self, fields: kernels.LiquidFields, gravity: np.ndarray, dt: float) -> None:
         """Launch the motion of the particles, and the removal of those that it marks."""
@@ -261,9 +290,11 @@ class Whitewater:
 
     def _limit(self) -> None:
         """Remove the oldest particles if there are more than `max_particles`."""
-        particles = self.particles
-        self.removed = max(particles.count - self.settings.max_particles, 0)
-        if self.removed:
+        particles, part = self.particles, self.grid.part
+        self.removed = max(int(part.ranks.sum(particles.count)) - self.settings.max_particles, 0)
+        if self.removed and part.shared:
+            self._remove_oldest()
+        elif self.removed:
             launch_list(
                 kernels.mark_first_kernel,
                 particles.count,
@@ -272,8 +303,23 @@ class Whitewater:
             )
             particles.remove(particles.marks)
 
+    def _remove_oldest(self) -> None:
+        """Remove the oldest of all ranks' particles, `removed` of them; collective.
+
+        After migrations the particles are in no order of age.
+        """
+        particles = self.particles
+        ages = particles.arrays()["kept"].numpy()[:, 0]
+        order = np.argsort(-ages, kind="stable")[: self.removed]
+        own = subdomain_of(self.grid).count_of_oldest(ages[order], self.removed)
+        if own:
+            marks = np.zeros(particles.count, dtype=np.int32)
+            marks[order[:own]] = 1
+            particles.marks.assign(marks)
+            particles.remove(particles.marks)
+
     def _row(self) -> Row:
-        """Return the values of `COLUMNS`."""
+        """Return the values of `COLUMNS`, summed over ranks; collective."""
         particles, counts = self.particles, self._counts
         clear(counts.array)
         if particles.count:
@@ -285,5 +331,6 @@ class Whitewater:
                 ordered=True,
             )
         counts.changed()
-        values = [*counts.numpy().tolist(), self.removed]
+        everyone = self.grid.part.ranks.sum(counts.numpy())
+        values = [*everyone.tolist(), self.removed]
         return dict(zip(COLUMNS, values, strict=True))

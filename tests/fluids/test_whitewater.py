@@ -15,7 +15,7 @@ import warp as wp
 import small_liquids
 from small_liquids import box, create, scene
 from small_runs import StepCounter, run_into, written_files
-from warp_lcp.extras.usd import export_run
+from warp_lcp.extras.export import export_run
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.fluids import whitewater_kernels as kernels
 from warp_lcp.fluids.whitewater import COLUMNS, KINDS, STATE, directions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +17,11 @@ from warp_lcp.material.particle_scene import ParticleScene
 NOT_ON_RANKS = (
     "is not there on several processes (--engine petsc) yet: leave it out, or run on one process"
 )
+
+# Ghost layers besides those within reach of a cell: values between the outermost two centers are
+# interpolated, and the ring has no velocity at its centers.
+BESIDE = 2
+ROUNDED = 1e-3  # cells; the longest reach in a message has four digits
 
 
 def check_shared(
@@ -51,6 +57,7 @@ def part_of(
     methods: Sequence[str],
     refused: Sequence[str] = (),
     smoothing: int = 0,
+    reach: tuple[str, float] | None = None,
     balance: Balance = DEFAULT_BALANCE,
 ) -> Subdomain:
     """Return this rank's part of the grid; collective.
@@ -64,10 +71,12 @@ def part_of(
         methods: that solve problems of several ranks.
         refused: keys of the scene that are not available on ranks.
         smoothing: binomial passes over the level set.
+        reach: key of the scene and its length [m], if a rank reads fields at that distance from its
+            cells.
         balance: when to repartition.
 
     Raises:
-        ValueError: as of `check_shared`; on all ranks.
+        ValueError: as of `check_shared`, or the boxes are too small for `reach`; on all ranks.
     """
     check_shared(scene, ranks, refused, methods)
     counts, layers = scene.cell_counts, ghost_layers(scene.time.cfl, smoothing)
@@ -75,6 +84,9 @@ def part_of(
         layers = max(
             layers, surface_layers(scene.output.surface_resolution or scene.particles.per_axis)
         )
+    least = layers
+    if reach is not None:
+        layers = max(layers, math.ceil(reach[1] / scene.spacing - ROUNDED) + BESIDE)
     size = np.array([*scene.domain.size, scene.spacing][:3])
     start = []
     for shape in scene.materials()[1]:
@@ -89,7 +101,15 @@ def part_of(
         start.append((low / scene.spacing, high / scene.spacing))
     volume = sum(float(np.prod(high - low)) for low, high in start)
     rest = pool(counts, scene.dimension, volume, np.array(scene.physics.gravity))
-    processes = balanced_processes(counts, ranks.size, layers=layers, states=[start, [rest]])
+    states = [start, [rest]]
+    processes = balanced_processes(counts, ranks.size, layers=layers, states=states)
+    if processes is None and reach is not None:
+        for fewer in range(layers - 1, least - 1, -1):
+            if balanced_processes(counts, ranks.size, layers=fewer, states=states) is not None:
+                raise ValueError(
+                    f"{reach[0]} = {reach[1]:.4g} m reaches beyond the boxes of {ranks.size} "
+                    f"ranks: at most {(fewer - BESIDE) * scene.spacing:.4g} m, or start fewer ranks"
+                )
     decomposition = Decomposition(counts, ranks, processes=processes, periodic=scene.endless)
     return Subdomain(
         decomposition,

@@ -14,6 +14,8 @@ Piece = Mapping[str, np.ndarray]
 
 ALIKE = ("bodies", "body_contacts")  # tables that are the same on all ranks
 IDENTITY = (ID, FIRST_IDS, BIRTH_TIMES)  # arrays that a state has with `output.ids`
+# Arrays of passive particles, which have no places: their numbers differ from the material's.
+PASSIVE = ("whitewater_position", "whitewater_velocity", "whitewater_state")
 LATER = {STATE: np.float64}  # arrays that exist after the first density correction
 
 
@@ -82,6 +84,8 @@ def state_of(pieces: Sequence[Piece], like: Mapping[str, np.ndarray]) -> dict[st
     for name, values in like.items():
         if name in fields:
             state[name] = np.array(values)
+        elif name in PASSIVE:
+            state[name] = np.concatenate([piece[name] for piece in pieces])
         elif name == ID or (values.ndim == 2 and name not in ALIKE):
             state[name] = np.concatenate([piece[name] for piece in pieces])[order]
         else:
