@@ -135,6 +135,8 @@ def scene_of_every_table(seed: int) -> Tables:
             "surface_ply": rng.random() < 0.3,
             "grid_format": rng.choice(["vtu", "vti"]),
             "volume": draw.dimension == 3,
+            "volume_format": rng.choice(["nvdb", "vdb"]) if draw.dimension == 3 else "nvdb",
+            "ids": True,
             "checkpoint_every": 2,
             "checkpoint_minutes": 5.0,
         },

@@ -110,6 +110,7 @@ CHOSEN = (
     "splash-unilateral",
     "stirred-tank",
     "tap-and-drain",
+    "whitewater",
 )
 EMULATED = pytest.mark.skipif(
     "emulated_cuda" not in sys.modules, reason="the plugin emulated_cuda is not there"
