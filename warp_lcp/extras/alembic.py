@@ -124,9 +124,11 @@ class AlembicArchive:
             self._set_shape(self._surface, surface.points, surface.corners, velocity, normals)
         if self._particles is not None:
             self._particles.set(self._recording.particles(number))
-        whitewater = self._recording.whitewater(number)
-        if self._whitewater is not None and whitewater is not None:
-            self._whitewater.set(whitewater)
+        if self._whitewater is not None:
+            whitewater = self._recording.whitewater(number)
+            # Each frame needs a sample: the times of samples are those of the frames in order.
+            nothing = Points("whitewater", np.zeros((0, 3), dtype=np.float32), {})
+            self._whitewater.set(nothing if whitewater is None else whitewater)
         self._set_bodies(number)
         for motion, place in self._moving:
             pose = motion.pose(self._time.frame_time(number))

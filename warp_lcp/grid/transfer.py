@@ -94,7 +94,7 @@ def particles_to_faces(
     offsets: wp.array | None = None,
     runs: wp.array | None = None,
 ) -> None:
-    """Particles to grid (P2G): average the particles' velocities on the faces.
+    """Particle-to-grid transfer (P2G): average the particles' velocities on the faces.
 
     All particles have the same weight.
 
