@@ -8,6 +8,7 @@ cells nor on the steps. The particles do not act on the liquid.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 # Half the thickness of the foam: a part of `length`, but at most as far as phi is known [cells].
 LAYER, LAYER_CELLS = 1.0 / 16.0, 0.5
 FAR = 1e9  # [m]
+MOST_NEW = 2**30  # expected bound of the new particles of a step; their sums are 32-bit integers
 SAMPLE_SPACING = 0.6  # mean distance of sampled cells in a step, relative to `length`
 KINDS = ("spray", "foam", "bubbles")  # of the log's columns, in the order of the kernels' numbers
 COLUMNS = (*(f"whitewater_{kind}" for kind in KINDS), "whitewater_removed")
@@ -95,6 +97,7 @@ class Whitewater:
         self._directions = wp.array(directions(grid.dimension), dtype=wp.vec3, device=grid.device)
         self._counts = DeviceScalar(grid.device, len(KINDS), wp.int32)
         self.removed = 0  # in the last step, because there were too many
+        self._skipped = 0  # new ones among them, which were not written
 
     def allocate(self, grid: StaggeredGrid) -> None:
         """Allocate the fields of a grid: its liquid, and numbers of new particles."""
@@ -220,6 +223,8 @@ class Whitewater:
         # As many samples a volume on all grids: cost and noise do not depend on the cells.
         numbers.spread = max(SAMPLE_SPACING * settings.length / grid.spacing, 1.0)
         numbers.share = numbers.spread**-grid.dimension
+        # The sum over all sampled cells stays far below 2^31, also where more than expected are.
+        numbers.most = MOST_NEW // (int(numbers.share * math.prod(grid.shape)) + 100)
         volume, area = grid.cell_volume, grid.spacing ** (grid.dimension - 1)
         numbers.trapped = settings.trapped_air_rate * volume * dt / numbers.share
         numbers.crest = settings.crest_rate * area * dt / numbers.share
@@ -231,7 +236,8 @@ class Whitewater:
         return numbers
 
     def _emit(self, fields: kernels.LiquidFields, window: Window, step: int, dt: float) -> None:
-        """Add the new particles of a step, in the order of cells."""
+        """Add the new particles of a step, in the order of cells; of too many the last ones."""
+        self._skipped = 0
         numbers, ends = self._emission(step, dt), self._ends
         clear(ends)
         window.launch(kernels.count_kernel, [fields, numbers, ends])
@@ -240,9 +246,11 @@ class Whitewater:
         new = int(flat[-1:].numpy()[0])
         if new == 0:
             return
-        old = self.particles.make_room(new)
-        arrays = self.particles.arrays()
-        window.launch(kernels.emit_kernel, [fields, numbers, ends, old, *arrays.values()])
+        # More would all be removed at the end of the step.
+        self._skipped = max(new - self.settings.max_particles, 0)
+        old = self.particles.make_room(new - self._skipped)
+        inputs = [fields, numbers, ends, self._skipped, old, *self.particles.arrays().values()]
+        window.launch(kernels.emit_kernel, inputs)
 
     def _move(self, fields: kernels.LiquidFields, gravity: np.ndarray, dt: float) -> None:
         """Launch the motion of the particles, and the removal of those that it marks."""
@@ -262,12 +270,13 @@ class Whitewater:
     def _limit(self) -> None:
         """Remove the oldest particles if there are more than `max_particles`."""
         particles = self.particles
-        self.removed = max(particles.count - self.settings.max_particles, 0)
-        if self.removed:
+        surplus = max(particles.count - self.settings.max_particles, 0)
+        self.removed = surplus + self._skipped
+        if surplus:
             launch_list(
                 kernels.mark_first_kernel,
                 particles.count,
-                [self.removed, particles.marks],
+                [surplus, particles.marks],
                 device=self.grid.device,
             )
             particles.remove(particles.marks)
