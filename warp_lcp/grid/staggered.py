@@ -389,7 +389,7 @@ class ActiveWindow(Window):
     low = property(lambda self: self._now.low)
     high = property(lambda self: self._now.high)
     near = property(lambda self: self._now.near)
-    now = property(lambda self: self._now)
+    current = property(lambda self: self._now)
     cells = property(lambda self: self._now.cells)
 
     def move_to(self, window: Window) -> None:
