@@ -44,8 +44,8 @@ auto light = [&](int d, long long o) {
 };
 
 // snippet openings: Solids that cut cells (CUT): open part of a cell's lower faces, and the part of
-// a cell that its differences along an axis stand for. CUT is 2 if some move: the last layer has the
-// rate at which their walls free space for the cell's sand, times dx / volume [m/s].
+// a cell that its differences along an axis stand for. CUT is 2 if some move: the last layer has
+// the rate at which their walls free space for the cell's sand, times dx / volume [m/s].
 #if CUT
 auto open = [&](int axis, long long i) INLINE { return (T)openings[axis * layer + i]; };
 auto counted = [&](int axis, long long i) INLINE { return (T)openings[(DIM + axis) * layer + i]; };

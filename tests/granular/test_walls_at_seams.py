@@ -1,4 +1,4 @@
-"""Thin walls at the seam of a periodic axis: the same faces, velocities and answers as elsewhere."""
+"""Thin walls at the seam of a periodic axis: same faces, velocities, answers as elsewhere."""
 
 from typing import Any
 
