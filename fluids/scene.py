@@ -205,6 +205,8 @@ class LiquidScene(ParticleScene):
                     f"surface_tension.contact_angle = {tension.contact_angle:g} is in degrees; if "
                     f"radians were meant, it is {degrees:.3g}"
                 )
+        if self.whitewater is not None:
+            notes += self._whitewater_notes(self.whitewater)
         drags = (
             [
                 ("wall_drag.coefficient", self.wall_drag.coefficient),
@@ -219,6 +221,17 @@ class LiquidScene(ParticleScene):
         ]:
             notes += DRAG.notes(place, value)
         return notes
+
+    def _whitewater_notes(self, settings: WhitewaterSettings) -> list[str]:
+        """Return a note if the length of whitewater is not between a cell and the domain."""
+        length = settings.length
+        if length is None or self.spacing <= length <= max(self.domain.size):
+            return []
+        return [
+            f"whitewater.length = {length:g} m: lengths between a cell, {self.spacing:.3g} m, and "
+            "the domain are usual; within a cell all velocities are alike, and beyond the domain "
+            "there is no liquid to compare"
+        ]
 
     def _viscosity_errors(self) -> list[CrossKeyError]:
         """Return errors of settings that need viscosity or exclude it."""

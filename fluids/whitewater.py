@@ -11,6 +11,7 @@ reach as far as the compared points. After a step each particle goes to the rank
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
 # Half the thickness of the foam: a part of `length`, but at most as far as phi is known [cells].
 LAYER, LAYER_CELLS = 1.0 / 16.0, 0.5
 FAR = 1e9  # [m]
+MOST_NEW = 2**30  # expected bound of the new particles of a step; their sums are 32-bit integers
 SAMPLE_SPACING = 0.6  # mean distance of sampled cells in a step, relative to `length`
 KINDS = ("spray", "foam", "bubbles")  # of the log's columns, in the order of the kernels' numbers
 COLUMNS = (*(f"whitewater_{kind}" for kind in KINDS), "whitewater_removed")
@@ -100,6 +102,7 @@ class Whitewater:
         self._directions = wp.array(directions(grid.dimension), dtype=wp.vec3, device=grid.device)
         self._counts = DeviceScalar(grid.device, len(KINDS), wp.int32)
         self.removed = 0  # in the last step on all ranks, because there were too many
+        self._skipped = 0  # new ones of this rank among them, which were not written
 
     def allocate(self, grid: StaggeredGrid) -> None:
         """Allocate the fields of a grid: its liquid, and numbers of new particles."""
@@ -246,6 +249,8 @@ class Whitewater:
         # As many samples a volume on all grids: cost and noise do not depend on the cells.
         numbers.spread = max(SAMPLE_SPACING * settings.length / grid.spacing, 1.0)
         numbers.share = numbers.spread**-grid.dimension
+        # The sum over all sampled cells stays far below 2^31, also where more than expected are.
+        numbers.most = MOST_NEW // (int(numbers.share * math.prod(grid.shape)) + 100)
         volume, area = grid.cell_volume, grid.spacing ** (grid.dimension - 1)
         numbers.trapped = settings.trapped_air_rate * volume * dt / numbers.share
         numbers.crest = settings.crest_rate * area * dt / numbers.share
@@ -257,7 +262,8 @@ class Whitewater:
         return numbers
 
     def _emit(self, fields: kernels.LiquidFields, window: Window, step: int, dt: float) -> None:
-        """Add the new particles of a step, in the order of cells."""
+        """Add the new particles of a step, in the order of cells; of too many the last ones."""
+        self._skipped = 0
         own = self.grid.part.near(window, 0)  # other ranks emit in their own cells
         if own is None:
             return
@@ -269,9 +275,11 @@ class Whitewater:
         new = int(flat[-1:].numpy()[0])
         if new == 0:
             return
-        old = self.particles.make_room(new)
-        arrays = self.particles.arrays()
-        own.launch(kernels.emit_kernel, [fields, numbers, ends, old, *arrays.values()])
+        # More would all be removed at the end of the step.
+        self._skipped = max(new - self.settings.max_particles, 0)
+        old = self.particles.make_room(new - self._skipped)
+        inputs = [fields, numbers, ends, self._skipped, old, *self.particles.arrays().values()]
+        own.launch(kernels.emit_kernel, inputs)
 
     def _move(self, fields: kernels.LiquidFields, gravity: np.ndarray, dt: float) -> None:
         """Launch the motion of the particles, and the removal of those that it marks."""
@@ -291,27 +299,28 @@ class Whitewater:
     def _limit(self) -> None:
         """Remove the oldest particles if there are more than `max_particles`."""
         particles, part = self.particles, self.grid.part
-        self.removed = max(int(part.ranks.sum(particles.count)) - self.settings.max_particles, 0)
-        if self.removed and part.shared:
-            self._remove_oldest()
-        elif self.removed:
+        surplus = max(int(part.ranks.sum(particles.count)) - self.settings.max_particles, 0)
+        self.removed = surplus + int(part.ranks.sum(self._skipped))
+        if surplus and part.shared:
+            self._remove_oldest(surplus)
+        elif surplus:
             launch_list(
                 kernels.mark_first_kernel,
                 particles.count,
-                [self.removed, particles.marks],
+                [surplus, particles.marks],
                 device=self.grid.device,
             )
             particles.remove(particles.marks)
 
-    def _remove_oldest(self) -> None:
-        """Remove the oldest of all ranks' particles, `removed` of them; collective.
+    def _remove_oldest(self, surplus: int) -> None:
+        """Remove the `surplus` oldest particles of all ranks; collective.
 
         After migrations the particles are in no order of age.
         """
         particles = self.particles
         ages = particles.arrays()["kept"].numpy()[:, 0]
-        order = np.argsort(-ages, kind="stable")[: self.removed]
-        own = subdomain_of(self.grid).count_of_oldest(ages[order], self.removed)
+        order = np.argsort(-ages, kind="stable")[:surplus]
+        own = subdomain_of(self.grid).count_of_oldest(ages[order], surplus)
         if own:
             marks = np.zeros(particles.count, dtype=np.int32)
             marks[order[:own]] = 1

@@ -81,7 +81,8 @@ class EmissionSettings:
     """Numbers of the emission in a step.
 
     A cell is sampled with the probability `share`, and stands for a cube of side `spread` [cells].
-    `reach` is the distance of compared points [cells] in `directions`, `count` of them. `trapped`
+    It gives at most `most` particles in a step. `reach` is the distance of compared points [cells]
+    in `directions`, `count` of them. `trapped`
     and `crest` are particles of a full potential per sampled cell in the step, by volume and by
     area. The ranges of the potentials are [m/s], dimensionless, and [m^2/s^2].
     """
@@ -89,6 +90,7 @@ class EmissionSettings:
     seed: int
     step: int
     count: int
+    most: int
     share: float
     spread: float
     reach: float
@@ -310,7 +312,10 @@ def count_kernel(k, j, i, F: LiquidFields, E: EmissionSettings, ends: I32):
                     X = sample_point(h, 0, 1.0, k, j, i)
                     trapped, crest, _normal, _v = emission(F, E, X)
                     if trapped + crest > 0.0:
-                        ends[k, j, i] = int(trapped + crest + uniform(h, 3))
+                        ends[k, j, i] = E.most
+                        # Larger numbers may not be integers of 32 bits.
+                        if trapped + crest < float(E.most):
+                            ends[k, j, i] = int(trapped + crest + uniform(h, 3))
 
 
 @cell_kernel(MODULE)
@@ -321,12 +326,13 @@ def emit_kernel(
     F: LiquidFields,
     E: EmissionSettings,
     ends: I32,
+    skipped: int,
     old: int,
     position: POINTS,
     velocity: POINTS,
     state: POINTS,
 ):
-    """Write the new particles of each cell behind the `old` ones.
+    """Write the new particles of each cell behind the `old` ones, without the first `skipped`.
 
     `ends` are the inclusive sums of the cells' numbers, in the order of cells. Particles from
     trapped air begin anywhere in the cube that the cell stands for, those from a crest above the
@@ -342,11 +348,12 @@ def emit_kernel(
             first = ends[k, j - 1, ends.shape[2] - 1]
         else:
             first = ends[k - 1, ends.shape[1] - 1, ends.shape[2] - 1]
-    if last > first:
+    if last > wp.max(first, skipped):
         h = cell_hash(F, E, k, j, i)
         X = sample_point(h, 0, 1.0, k, j, i)
         trapped, crest, normal, v = emission(F, E, X)
-        for q in range(last - first):
+        for q in range(wp.max(skipped - first, 0), last - first):
+            slot = old + first + q - skipped
             own = hashed(h, wp.uint32(16 + q))
             Y = sample_point(own, 0, E.spread, k, j, i)
             if uniform(own, 3) * (trapped + crest) >= trapped:
@@ -365,11 +372,11 @@ def emit_kernel(
             ) - wp.vec3(F.dx, F.dx, F.dx)
             if F.planes == 1:
                 x[2] = 0.0
-            position[old + first + q] = x
-            velocity[old + first + q] = v + _SPREAD * wp.length(v) * beside
+            position[slot] = x
+            velocity[slot] = v + _SPREAD * wp.length(v) * beside
             age = -E.dt * uniform(own, 8)
             life = E.lifetime * (0.5 + uniform(own, 9))
-            state[old + first + q] = wp.vec3(age, life, float(_FOAM))
+            state[slot] = wp.vec3(age, life, float(_FOAM))
 
 
 @wp.func

@@ -365,6 +365,24 @@ def test_a_run_goes_on_as_if_it_had_not_stopped(tables):
     assert all(np.array_equal(first[name], second[name]) for name in first)
 
 
+def test_a_dam_at_one_side_keeps_its_volume_and_goes_on_bit_for_bit():
+    """Its window changes from step to step, and the surface clears the cells it has left."""
+    model = scene(
+        size=[1.0, 0.75],
+        resolution=40,
+        liquid=[box([0.0, 0.0], [0.4, 0.6])],
+        particles={"narrow_band": {"width": 4.0}},
+    )
+    simulation = create(model)
+    rows = advance(simulation, 0.3)
+    assert rows[-1]["volume"] == pytest.approx(0.24, rel=0.03)
+    twin = create(model)
+    twin.restore(simulation.state())
+    for _ in range(3):
+        dt = simulation.stable_dt()
+        assert simulation.step(dt) == twin.step(dt)
+
+
 def test_a_state_belongs_to_its_band():
     """Refusal of a state for another band.
 

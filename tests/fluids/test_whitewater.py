@@ -241,6 +241,27 @@ def test_the_oldest_go_if_there_are_too_many() -> None:
     assert (np.diff(ages) <= 0.011).all()  # the first are the oldest, up to a step
 
 
+def test_huge_rates_take_no_more_memory_than_the_largest_number() -> None:
+    def first_emission(rate: float, most: int) -> Any:
+        """Return a splash after its first step that emits particles."""
+        tables = LIVELY | {"crest_rate": rate, "trapped_air_rate": rate, "max_particles": most}
+        simulation = splash(whitewater=tables)
+        while simulation.whitewater.particles.count == 0:
+            row = simulation.step(0.01)
+        return simulation, row["whitewater_removed"]
+
+    every, none = first_emission(1e7, 1_000_000)
+    limited, removed = first_emission(1e7, 40)
+    assert none == 0
+    assert removed == every.whitewater.particles.count - 40
+    for name, array in arrays_of(limited).items():
+        np.testing.assert_array_equal(array, arrays_of(every)[name][-40:])
+    # More than integers of 32 bits can count.
+    huge, removed = first_emission(1e17, 40)
+    assert huge.whitewater.particles.count == 40
+    assert 0 < removed < 2**31
+
+
 def test_open_sides_and_drains_take_particles() -> None:
     simulation = create(
         scene(
@@ -302,6 +323,12 @@ def test_wrong_values_are_refused(key: str, value: Any, message: str) -> None:
     with pytest.raises(SceneError, match=message) as caught:
         load_scene("dam-break-2d", [f"whitewater.{key}={value}"])
     assert f"whitewater.{key}" in str(caught.value)
+
+
+@pytest.mark.parametrize(("length", "notes"), [(0.1, 0), (1e-3, 1), (1e3, 1)])
+def test_a_length_that_emits_nothing_is_noted(length: float, notes: int) -> None:
+    scene = load_scene("dam-break-2d", [f"whitewater.length={length}"])
+    assert sum("whitewater.length" in note for note in scene.notes()) == notes
 
 
 def test_a_surface_of_cells_is_refused() -> None:

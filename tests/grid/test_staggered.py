@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from warp_lcp.grid.staggered import StaggeredGrid, cell_index
+from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window, cell_index
 
 
 def test_shapes_in_2d_and_3d() -> None:
@@ -65,3 +65,14 @@ def test_cells_of_points_off_the_grid_are_on_it() -> None:
         device="cpu",
     )
     assert out.numpy().tolist() == [1, 1, 1, 1, 2, 4, 4, 4, 4, 1]
+
+
+def test_a_window_of_steps_gives_the_window_it_has_now() -> None:
+    """Parts of a simulation remember it, to clear these cells when the window has moved on."""
+    device = wp.get_device("cpu")
+    first, second = (Window.of([1, 1, 1], [end, 4, 4], device) for end in (3, 4))
+    active = ActiveWindow(first)
+    assert active.current is first
+    assert first.current is first
+    active.move_to(second)
+    assert active.current is second

@@ -208,3 +208,22 @@ def test_check_and_run_report_a_dt_min_above_the_capillary_limit(tmp_path: Path)
     )
     short = load_scene({**DROP, "time": {**DROP["time"], "dt_min": 6e-9}})
     assert not any("dt_min" in note for note in start(short, "cpu").notes())
+
+
+@pytest.mark.parametrize(
+    ("setting", "part"),
+    [
+        ('volume_format="vdb"', "volume"),
+        ('grid_format="vti"', "grid"),
+        ("surface_ply=true", "surface"),
+        ("ids=true", "particles"),
+    ],
+)
+def test_keys_of_parts_that_are_not_written_are_noted(setting: str, part: str) -> None:
+    def notes(written: str) -> list[str]:
+        scene = load_scene("dam-break", [f"output.{setting}", f"output.{part}={written}"])
+        return [note for note in scene.notes() if "has no effect" in note]
+
+    assert notes("true") == []
+    (note,) = notes("false")
+    assert f"without output.{part}" in note

@@ -103,6 +103,7 @@ def scene_notes(scene: Scene) -> Iterator[str]:
             f"{1.0 / time.frames_per_second:g} s at time.frames_per_second ="
             f" {time.frames_per_second:g}: only the first and the last frame are written"
         )
+    yield from _output_notes(scene)
     for number, solid in enumerate(scene.solid):
         yield from _solid_notes(scene, f"solid[{number}]", solid)
     for place, shape in scene.shapes():
@@ -113,6 +114,21 @@ def scene_notes(scene: Scene) -> Iterator[str]:
                 f"{place}.velocity = {velocity} is in m/s (sound in air: 340); if mm/s were "
                 "meant, divide by 1000"
             )
+
+
+def _output_notes(scene: Scene) -> Iterator[str]:
+    """Yield keys of [output] that have no effect, because what they change is not written."""
+    output, has_bodies = scene.output, any(solid.is_body for solid in scene.solid)
+    unused = {
+        'volume_format = "vdb"': (output.volume_format == "vdb", output.volume, "volume"),
+        'grid_format = "vti"': (output.grid_format == "vti", output.grid, "grid"),
+        # Rigid bodies are surfaces, too.
+        "surface_ply = true": (output.surface_ply, output.surface or has_bodies, "surface"),
+        "ids = true": (output.ids, output.particles, "particles"),
+    }
+    for setting, (chosen, written, part) in unused.items():
+        if chosen and not written:
+            yield f"output.{setting} has no effect without output.{part} = true"
 
 
 def _solid_notes(scene: Scene, place: str, solid: Solid) -> Iterator[str]:
