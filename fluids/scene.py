@@ -228,9 +228,9 @@ class LiquidScene(ParticleScene):
         if length is None or self.spacing <= length <= max(self.domain.size):
             return []
         return [
-            f"whitewater.length = {length:g} m: lengths between a cell, {self.spacing:.3g} m, and "
-            "the domain are usual; within a cell all velocities are alike, and beyond the domain "
-            "there is no liquid to compare"
+            f"whitewater.length = {length:g} m: usual lengths are between a cell, "
+            f"{self.spacing:.3g} m, and the domain's longest side; others give few particles or "
+            "none"
         ]
 
     def _viscosity_errors(self) -> list[CrossKeyError]:

@@ -254,9 +254,9 @@ class Whitewater:
         volume, area = grid.cell_volume, grid.spacing ** (grid.dimension - 1)
         numbers.trapped = settings.trapped_air_rate * volume * dt / numbers.share
         numbers.crest = settings.crest_rate * area * dt / numbers.share
-        numbers.trapped_air = wp.vec2(*settings.trapped_air)
-        numbers.curvature = wp.vec2(*settings.crest)
-        numbers.energy = wp.vec2(*(0.5 * speed**2 for speed in settings.speed))
+        numbers.trapped_air_range = wp.vec2(*settings.trapped_air)
+        numbers.crest_range = wp.vec2(*settings.crest)
+        numbers.energy_range = wp.vec2(*(0.5 * speed**2 for speed in settings.speed))
         numbers.layer, numbers.lifetime = self.layer / grid.spacing, settings.lifetime
         numbers.dt = dt
         return numbers

@@ -58,11 +58,11 @@ _SECOND = wp.constant(wp.uint32(0x846CA68B))
 class LiquidFields:
     """Liquid and solids of a step.
 
-    `centers` has the velocity at cell centers [m/s], and `AIR` minus the distance to the surface
-    [cells]: 0 is air, far from liquid. `base` are the cells of solids, `distance` that to solids at
-    the low corners of cells [cells], used if `cut` is not 0. `origin` is the number of cells
-    (x, y, z) before the stored ones. Particles stay between `low` and `high` [m], which are far
-    away at open sides.
+    `planes` is 1 in 2-D, 2 in 3-D. `centers` has the velocity at cell centers [m/s], and `AIR`
+    minus the distance to the surface [cells]: 0 is air, far from liquid. `base` are the cells of
+    solids, `distance` that to solids at the low corners of cells [cells], used if `cut` is not 0.
+    `origin` is the number of cells (x, y, z) before the stored ones. Particles stay between `low`
+    and `high` [m], which are far away at open sides.
     """
 
     planes: int
@@ -82,9 +82,9 @@ class EmissionSettings:
 
     A cell is sampled with the probability `share`, and stands for a cube of side `spread` [cells].
     It gives at most `most` particles in a step. `reach` is the distance of compared points [cells]
-    in `directions`, `count` of them. `trapped`
-    and `crest` are particles of a full potential per sampled cell in the step, by volume and by
-    area. The ranges of the potentials are [m/s], dimensionless, and [m^2/s^2].
+    in `directions`, `count` of them. `trapped` and `crest` are particles of a full potential per
+    sampled cell in the step, by volume and by area. The potentials rise over `trapped_air_range`
+    [m/s], `crest_range` (dimensionless) and `energy_range` [m^2/s^2].
     """
 
     seed: int
@@ -96,9 +96,9 @@ class EmissionSettings:
     reach: float
     trapped: float
     crest: float
-    trapped_air: wp.vec2
-    curvature: wp.vec2
-    energy: wp.vec2
+    trapped_air_range: wp.vec2
+    crest_range: wp.vec2
+    energy_range: wp.vec2
     layer: float  # half the thickness of the foam [cells]
     lifetime: float  # [s]
     dt: float  # [s]
@@ -241,10 +241,10 @@ def emission(F: LiquidFields, E: EmissionSettings, X: wp.vec3):
     trapped = float(0.0)
     crest = float(0.0)
     normal = wp.vec3(0.0, 0.0, 0.0)
-    v, here = liquid_at(F, X)
-    if here < 1.0:
-        moving = clamped_ramp(0.5 * wp.dot(v, v), E.energy)
-        if moving > 0.0:
+    v, phi = liquid_at(F, X)
+    if phi < 1.0:
+        phi_k = clamped_ramp(0.5 * wp.dot(v, v), E.energy_range)
+        if phi_k > 0.0:
             approach = float(0.0)
             filled = float(0.0)
             seen = float(0.0)
@@ -255,31 +255,31 @@ def emission(F: LiquidFields, E: EmissionSettings, X: wp.vec3):
                 Y = X + E.reach * r
                 if is_stored(F, Y):
                     if not is_solid(F, Y):
-                        there, phi = liquid_at(F, Y)
-                        share = wp.clamp(0.5 - phi, 0.0, 1.0)
+                        v_m, phi_m = liquid_at(F, Y)
+                        share = wp.clamp(0.5 - phi_m, 0.0, 1.0)
                         seen += 1.0
                         filled += share
                         toward += share * r
                         around += r
                         if share > 0.0:
-                            change = wp.dot(there - v, r)
+                            change = wp.dot(v_m - v, r)
                             approach += share * wp.max(-change, 0.0)
-            if here < 0.0:
+            if phi < 0.0:
                 v_ta = 2.0 * approach / float(E.count)
-                trapped = E.trapped * moving * clamped_ramp(v_ta, E.trapped_air)
-            area = 1.0 - wp.abs(here)
+                trapped = E.trapped * phi_k * clamped_ramp(v_ta, E.trapped_air_range)
+            area = 1.0 - wp.abs(phi)
             if area > 0.0 and seen >= 0.5 * float(E.count):
                 f = filled / seen
                 n = f * around - toward
                 size = wp.length(n)
                 if size > 1.0e-6:
                     normal = n / size
-                    bend = 2.0 * (1.0 - 2.0 * f)
+                    r_kappa = 2.0 * (1.0 - 2.0 * f)
                     if F.planes == 1:
-                        bend = 2.0 * wp.sin(1.5707963 * (1.0 - 2.0 * f))
+                        r_kappa = 2.0 * wp.sin(1.5707963 * (1.0 - 2.0 * f))
                     if wp.dot(v, normal) >= _LEAVES * wp.length(v):
                         bulk = 2.0 * f
-                        crest = E.crest * area * bulk * moving * clamped_ramp(bend, E.curvature)
+                        crest = E.crest * area * bulk * phi_k * clamped_ramp(r_kappa, E.crest_range)
     return trapped, crest, normal, v
 
 

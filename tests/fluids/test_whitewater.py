@@ -398,8 +398,8 @@ def emission_at(
     numbers.directions = wp.array(directions(dimension), dtype=wp.vec3, device="cpu")
     numbers.count, numbers.reach = len(numbers.directions), reach
     numbers.trapped = numbers.crest = 1.0
-    numbers.trapped_air = numbers.curvature = wp.vec2(0.0, 1.0)
-    numbers.energy = wp.vec2(0.0, 1e-6)
+    numbers.trapped_air_range = numbers.crest_range = wp.vec2(0.0, 1.0)
+    numbers.energy_range = wp.vec2(0.0, 1e-6)
     at = wp.array(points, dtype=wp.vec3, device="cpu")
     out = [wp.zeros(len(points), dtype=wp.float32, device="cpu") for _ in range(2)]
     normal = wp.zeros(len(points), dtype=wp.vec3, device="cpu")

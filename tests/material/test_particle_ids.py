@@ -137,6 +137,14 @@ def test_ids_are_given_in_the_order_of_cells_and_ages_are_exact() -> None:
     assert ParticleIds().ages(np.zeros(0, dtype=np.int64), 2.0).shape == (0,)
 
 
+def test_the_age_of_a_particle_without_an_id_is_not_a_number() -> None:
+    births = ParticleIds()
+    assert np.isnan(births.ages(np.array([NO_ID]), 1.0)).all()
+    births.first, births.times, births.next = [0, 5], [0.25, 0.5], 8
+    found = births.ages(np.array([NO_ID, 0, 4, 5, 7]), 1.0)
+    np.testing.assert_array_equal(found, np.array([np.nan, 0.75, 0.75, 0.5, 0.5], np.float32))
+
+
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.every_case
 def test_ids_follow_particles_and_change_no_bit(name: str) -> None:

@@ -2,9 +2,9 @@
 
 NumPy writes them, version 224 of the format with the trees of `warp_lcp.frames.voxel_tree`: a
 header, then each grid with its metadata, its transform, its topology (masks of all nodes) and its
-buffers (values of the active voxels of all leaves). Inactive values are not stored: they are
-+background, or -background where a mask of the node says so (OpenVDB's compression of active
-masks).
+buffers (values of the active voxels of all leaves). Inactive values are not stored: each is
++background or -background. A mask of the node gives the sign. This is OpenVDB's "active mask"
+compression.
 
 TinyVDB (0.9) only replaces the values of a grid that it has read, one number a voxel: its level
 sets lose their class and their inside, which becomes +background.

@@ -93,9 +93,9 @@ class ParticleIds:
             self.next += total
 
     def ages(self, ids: np.ndarray, time: float) -> np.ndarray:
-        """Return the ages of particles at a time [s], float32, shape (n,)."""
-        event = np.searchsorted(np.array(self.first, dtype=np.int64), ids, side="right") - 1
-        born = np.array(self.times, dtype=np.float64)[event]
+        """Return the ages of particles at a time [s], float32, shape (n,); NaN without an id."""
+        event = np.searchsorted(np.array(self.first, dtype=np.int64), ids, side="right")
+        born = np.array([np.nan, *self.times])[event]  # events count from 1; 0: before the first id
         return np.asarray(time - born, dtype=np.float32)
 
     def state(self) -> dict[str, np.ndarray]:
