@@ -341,9 +341,7 @@ class ViscosityLevel:
         """
         planes, axes = self.grid.planes, range(self.dimension)
 
-        def mean(
-            out: wp.array, of: wp.array, faces: int, scale: float, wide: bool = False
-        ) -> None:
+        def mean(out: wp.array, of: wp.array, faces: int, scale: float, wide: bool = False) -> None:
             window.run(
                 self.passes.average,
                 self.shift,
