@@ -202,7 +202,7 @@ class RigidBodies:
         self.contact_residual = self._ranks.share(self.contact_residual)
 
     def release_lifted(self, speed: float) -> bool:
-        """Release supported bodies that the impulses of the material lift off their supports.
+        """Release supported bodies that the material lifts off their supports.
 
         The material has been solved with bodies that contacts hold. Contacts push, but do not pull:
         a body that approaches a floor through thick liquid would be held at its velocity against
