@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -33,7 +34,7 @@ from warp_lcp.grid.particles import SORTED, Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.grid.voxelize import PlacedSolid
 from warp_lcp.kernels.joined_graphs import joined
-from warp_lcp.kernels.launch_graph import LaunchGraph
+from warp_lcp.kernels.launch_graph import LaunchGraph, copy
 from warp_lcp.material.boundary_kernels import RELEASED, TOUCHES_NOTHING
 from warp_lcp.material.domain_window import start_of
 from warp_lcp.material.particle_assembly import (
@@ -148,6 +149,10 @@ class LiquidSimulation(ParticleSimulation):
             WallDrag(grid, self.boundary, drags, physics.density) if drags is not None else None
         )
         self.viscosity = make_viscosity(self.scene, grid, self.boundary, self.surface, self.bodies)
+        # Velocity before viscosity and pressure, for a second solve, see `_releases_bodies`.
+        viscous_bodies = self.viscosity is not None and self.bodies is not None
+        self._velocity_at_start = grid.faces() if viscous_bodies else []
+        self.spray_viscosity = None if self.viscosity is None else self.viscosity.of_spray()
         self.stokes = make_stokes(
             self.scene,
             grid,
@@ -226,6 +231,8 @@ class LiquidSimulation(ParticleSimulation):
             with self.watch.stage("bodies"):
                 self.projection.coupling.take_along(self.velocity, self.projection.kind)
         projected, viscous = self._solve_flow(window, dt, speed)
+        if self._releases_bodies(dt):
+            projected, viscous = self._solve_flow(window, dt, speed)
         if self.scene.output.diagnostics:
             with self.watch.stage("diagnostics", self.projection.kind):
                 self.surface.measure()  # before solids move
@@ -491,13 +498,36 @@ class LiquidSimulation(ParticleSimulation):
             viscous |= coupled
         return projected, viscous
 
+    def _releases_bodies(self, dt: float) -> bool:
+        """Release bodies that viscous liquid lifts off their supports, and undo the solves.
+
+        Returns whether there are any: the flow is to be solved again with the bodies free.
+        Velocities that gravity reaches in a step do not count.
+        """
+        if self.viscosity is None or self.bodies is None:
+            return False
+        kick = self.kick_dt * math.sqrt(self.gravity @ self.gravity)
+        with self.watch.stage("bodies"):
+            released = self.bodies.release_lifted(kick)
+        if released:
+            for u, before in zip(self.velocity, self._velocity_at_start, strict=True):
+                copy(u, before)
+            if self.forces is not None:
+                self.forces.impulses = self._impulses_before.copy()
+            if self.stokes is not None:
+                self.stokes.continues = False  # the last step's bodies were held
+        return released
+
     def _keep_start(self, viscosity: Viscosity) -> None:
         """Store what the step begins with, before the first projection."""
+        for before, u in zip(self._velocity_at_start, self.velocity, strict=False):
+            copy(before, u)
+        viscosity.begin_step(self.kick_dt)
         viscosity.store_velocity(self.velocity)
         if self.stokes is not None:
             self.stokes.keep_start(self.velocity, self.kick_dt)
-            if self.forces is not None:
-                self._impulses_before = self.forces.impulses.copy()
+        if self.forces is not None:
+            self._impulses_before = self.forces.impulses.copy()
         bodies = [] if self.bodies is None else self.bodies.bodies
         self._momenta_before = [body.momenta() for body in bodies]
 

@@ -59,6 +59,7 @@ from warp_lcp.kernels.launch_graph import Launch, LaunchGraph, clear, copy, laun
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.krylov.conjugate_gradient import ConjugateGradient
 from warp_lcp.material.boundary import Boundary, CutBoundary, WholeCells
+from warp_lcp.material.velocity_extrapolation import SprayViscosity
 from warp_lcp.problem.result import SolveStatus
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.rigid.body import PLANAR
@@ -209,7 +210,7 @@ class Viscosity:
         self._slips = wp.array(slips, dtype=wp.float32, device=grid.device)
         self._walls = ~open_sides_of(grid, boundary.open_sides) & (1 << 2 * grid.dimension) - 1
         self._walls_change, self._placed = boundary.moves or sources, False
-        self.multigrid = ViscosityMultigrid(grid)
+        self.multigrid = ViscosityMultigrid(grid, varies=thickest is not None)
         self._fine = self.multigrid.levels[0]
         size = grid.dimension * grid.size
         self._change = zeros(size, wp.float32, grid.device, small_pages=grid.sparse)
@@ -234,6 +235,7 @@ class Viscosity:
         )
         self._box, self._above = ActiveWindow(grid.everywhere), ActiveWindow(grid.everywhere)
         self._unknowns, self._tau = ActiveWindow(self._inner), Scalar()
+        self._spray_tau = Scalar()  # of a whole step, which may have several solves
         launches = (
             self._copy_velocity,
             self._set_up,
@@ -324,6 +326,15 @@ class Viscosity:
         return ViscousResult(
             iterations, residual, status, energy * (lost + driven), energy * driven
         )
+
+    def of_spray(self) -> SprayViscosity:
+        """Return the viscous stress on spray beside the liquid."""
+        relative = None if self.mixed is None else self.mixed.cells
+        return SprayViscosity(self._spray_tau, relative)
+
+    def begin_step(self, dt: float) -> None:
+        """Store for how long viscosity acts in a step [s], for `of_spray`."""
+        self._spray_tau.value = self._viscosity / self._density * dt / self.grid.spacing**2
 
     def prepare(self, window: Window, kind: wp.array, contact: wp.array, dt: float) -> bool:
         """Set up the equations of a step for another solve, without coarse levels.

@@ -119,6 +119,7 @@ class ViscousWallCoupling:
                 kind=walls.kind,
                 contact=walls.contact,
                 body=self._owners,
+                base=self.boundary.base,
                 center=center,
                 index=index,
                 width=self.width,

@@ -324,17 +324,24 @@ class ViscosityLevel:
         for field in self.x:
             self.grid.domain.run(CLEAR[wp.float32], launch=launch, field=field)
 
-    def average(self, fine: ViscosityLevel, window: Window, inner: Window) -> None:
+    def average(
+        self, fine: ViscosityLevel, window: Window, inner: Window, *, varies: bool = False
+    ) -> None:
         """Set the weights to averages of a finer level.
+
+        The interpolation also reaches cells across an axis that a coarse cell does not contain.
+        Where these are thicker by orders of magnitude, a mean without them is too small by as much,
+        and so is the coarse energy of what the interpolation does to them.
 
         Args:
             fine: the finer level.
             window: cells of this level with contributions of the finer one.
             inner: those of them in the domain.
+            varies: whether viscosities differ: weights of links include those cells.
         """
         planes, axes = self.grid.planes, range(self.dimension)
 
-        def mean(out: wp.array, of: wp.array, faces: int, scale: float) -> None:
+        def mean(out: wp.array, of: wp.array, faces: int, scale: float, wide: bool = False) -> None:
             window.run(
                 self.passes.average,
                 self.shift,
@@ -342,13 +349,14 @@ class ViscosityLevel:
                 fine=of,
                 planes=planes,
                 faces=faces,
+                wide=int(wide),
                 scale=scale,
             )
 
-        mean(self.cell, fine.cell, 0, 0.25)
-        mean(self.mixed, fine.mixed, 0, MIXED * 0.25)
+        mean(self.cell, fine.cell, 0, 0.25, varies)
+        mean(self.mixed, fine.mixed, 0, MIXED * 0.25, varies)
         for (a, b), edge in self.edges.items():
-            mean(edge, fine.edges[a, b], 1 << a | 1 << b, 0.25)
+            mean(edge, fine.edges[a, b], 1 << a | 1 << b, 0.25, varies)
         for axis in axes:
             mean(self.volume[axis], fine.volume[axis], 1 << axis, 1.0)
             mean(self.drag[axis], fine.drag[axis], 1 << axis, WALL)

@@ -27,6 +27,7 @@ class ViscosityMultigrid:
 
     Args:
         grid: the finest grid.
+        varies: whether viscosities differ.
 
     Attributes:
         r, z: flat float32 fields, one component after the other.
@@ -34,7 +35,8 @@ class ViscosityMultigrid:
         program: launches of one cycle.
     """
 
-    def __init__(self, grid: StaggeredGrid) -> None:
+    def __init__(self, grid: StaggeredGrid, *, varies: bool = False) -> None:
+        self._varies = varies
         self.grid, size, self._shared = (
             grid,
             grid.dimension * grid.size,
@@ -81,7 +83,8 @@ class ViscosityMultigrid:
         """Return the multigrid of the last level's whole grid."""
         last = self.levels[-1].grid
         return ViscosityMultigrid(
-            StaggeredGrid(last.domain_counts, last.spacing, last.dimension, last.device)
+            StaggeredGrid(last.domain_counts, last.spacing, last.dimension, last.device),
+            varies=self._varies,
         )
 
     def light_program(self) -> CommandBuffer:
@@ -152,7 +155,8 @@ class ViscosityMultigrid:
         fine.share(fine.equations)
         fine.find_spans(self._inner[0])
         for number, coarse in enumerate(self.levels[1:], start=1):
-            coarse.average(fine, self._boxes[number], self._inner[number])
+            boxes = self._boxes[number], self._inner[number]
+            coarse.average(fine, *boxes, varies=self._varies)
             fine.normalize(coarse, self._inner[number - 1])
             fine = coarse
         if self._gathered is not None:

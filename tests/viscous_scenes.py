@@ -158,6 +158,38 @@ def stirred_scene(seed: int) -> LiquidScene:
     )
 
 
+def hanging_thread(seed: int) -> LiquidScene:
+    """Return the scene of a seed: a thick thread that hangs from a sticky ceiling.
+
+    It is 2 to 5 cells wide, and in most scenes tilted. The splitting tolerance is 0.1 %, 5 % or
+    100 %.
+    """
+    rng = np.random.default_rng(seed)
+    dimension = int(rng.choice([2, 3]))
+    resolution = 24 if dimension == 2 else 16
+    width, length = rng.uniform(2.0, 5.0) / resolution, rng.uniform(0.3, 0.5)
+    middle = 0.5 + rng.uniform(-0.5, 0.5, dimension) / resolution
+    low, high = middle - 0.5 * width, middle + 0.5 * width
+    low[1], high[1] = 1.0 - length, 1.3
+    tilt = float(rng.uniform(-20.0, 20.0))
+    value = float(10.0 ** rng.uniform(3.0, 5.0))
+    turn: dict[str, Any] = {}
+    if rng.random() < 0.7:
+        angles = tilt if dimension == 2 else [float(rng.uniform(-20.0, 20.0)), 0.0, tilt]
+        turn = {
+            "rotate": angles,
+            "about": np.where(np.arange(dimension) == 1, 1.0, middle).tolist(),
+        }
+    share = [1e-3, 0.05, 1.0][int(rng.integers(3))]
+    return scene(
+        size=[1.0] * dimension,
+        resolution=resolution,
+        wall="sticky",
+        liquid=[box(low.tolist(), high.tolist(), **turn)],
+        viscosity={"value": value, "splitting_tolerance": share},
+    )
+
+
 def coupled_scene(seed: int) -> LiquidScene:
     """Return a scene of `viscous_scene` or `stirred_scene` with coupled solves.
 

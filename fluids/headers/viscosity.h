@@ -33,6 +33,12 @@ const auto beside = [&](long long i, long long q, float weight) {
     return weight * (inverse > 1.0f ? inverse : (h[q] < INFINITY ? 1.0f : 0.0f));
 };
 
+// snippet of_source: Whether a face belongs to a source, by the step along its component's axis.
+const auto source = [&](long long q, long long s) {
+    return ((kind[q] == SOLID) & (base[q] != SOLID)) |
+           ((kind[q - s] == SOLID) & (base[q - s] != SOLID));
+};
+
 // kernel fluids.viscosity.distance: Signed distance [cells] of a component's faces from walls that
 // liquid may stick to, and the slip length of the wall on faces in one, else -1
 //   compute    float32
@@ -243,11 +249,7 @@ double lost = 0, driven = 0, square = 0, large = 0;
 const auto wall_speed = [&](const float* of, long long i) {
     return MOVING ? (double)of[MOVING ? i : 0] : 0.0;
 };
-// whether a face belongs to a source, by the step along its component's axis
-const auto source = [&](long long q, long long s) {
-    return ((kind[q] == SOLID) & (base[q] != SOLID)) |
-           ((kind[q - s] == SOLID) & (base[q - s] != SOLID));
-};
+#include "of_source"
 // velocity of the wall at the end of the link from i to q along an axis
 const auto met = [&](int i, long long q, int other, int side) {
     if (source(q, sa)) return (double)u[q];
@@ -324,17 +326,19 @@ stiff = large;
 // kernel fluids.viscosity.links: Coupling of a component's faces to solids. For each link: its
 // weight, or that of a product with a face in the solid, times the velocities of the solid's unit
 // motions at the end of the link, or at that face. Without `entry_rows`: number of links in each
-// row.
+// row. Faces of sources have their own velocity, not that of a solid.
 //   compute    float32
 //   whole      int32 counts, offsets?, entry_rows?, blocks?, body; float64 values?, center
 //   box        float32 d, h, db, dc?, cell, mixed, xb, xc?, diagonal; int8 kind; uint8 contact;
-//              int16 wall?, wall_b?, wall_c?; int32 index?
+//              int16 wall?, wall_b?, wall_c?; int32 index?; int8 base
 //   numbers    int axis, planes, before_x, before_y, before_z; float32 dx; int width, from_
-//   constants  FLUID, RELEASED, CLOSE, THETA, ALONG, CUT
+//   constants  FLUID, SOLID, RELEASED, CLOSE, THETA, ALONG, CUT
 #include "viscous_walls"
+#include "of_source"
 const int begin = entry_rows ? offsets[k * (int)(s1 / s2) + j] : 0;
 int e = begin;
 const auto owner = [&](const short* walls, long long q, long long s) {  // of a face
+    if (source(q, s)) return -1;
     const int solid = CUT ? walls[CUT ? q : 0]
                           : (index[CUT ? 0 : q] > index[CUT ? 0 : q - s] ? index[CUT ? 0 : q]
                                                                          : index[CUT ? 0 : q - s]);

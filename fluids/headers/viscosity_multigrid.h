@@ -121,11 +121,12 @@ SIMD for (int i = low; i < high; ++i) {
 }
 
 // kernel fluids.viscosity.average: Mean over the finer level, times `scale`: of two cells per axis,
-// or of three faces if bit n of `faces` is set for axis n
+// or of three faces if bit n of `faces` is set for axis n. `wide`: of the four cells that the
+// interpolation reaches across a component's axis, weighted by its squares, 9 to 1
 //   compute    float32
 //   whole      float32 fine
 //   box        float32 out
-//   numbers    int planes, faces; float32 scale; int shift_x, shift_y, shift_z
+//   numbers    int planes, faces, wide; float32 scale; int shift_x, shift_y, shift_z
 #include "viscous_levels"
 const int mx = given.fine.shape[2], my = given.fine.shape[1], mz = given.fine.shape[0];
 const auto part = [&](int axis, int n, int c, int size, float& weight) {
@@ -134,14 +135,19 @@ const auto part = [&](int axis, int n, int c, int size, float& weight) {
         return n;
     }
     const bool face = faces >> axis & 1;
-    weight = face ? (c == 1 ? 0.5f : 0.25f) : (c < 2 ? 0.5f : 0.0f);
+    if (wide && !face) {
+        weight = c == 0 || c == 3 ? 0.05f : 0.45f;
+        return clamped(2 * n - 2 + c + shift[axis], size);
+    }
+    weight = c == 3 ? 0.0f : face ? (c == 1 ? 0.5f : 0.25f) : (c < 2 ? 0.5f : 0.0f);
     return clamped(2 * n - 1 - (int)face + c + shift[axis], size);
 };
+const int most = wide ? 4 : 3;
 for (int i = first; i < last; ++i) {
     float sum = 0.0f, wz, wy, wx;
-    for (int c = 0; c < 3; ++c)
-        for (int b = 0; b < 3; ++b)
-            for (int a = 0; a < 3; ++a) {
+    for (int c = 0; c < most; ++c)
+        for (int b = 0; b < most; ++b)
+            for (int a = 0; a < most; ++a) {
                 const long long z = part(2, k, c, mz, wz), y = part(1, j, b, my, wy),
                                 x = part(0, i, a, mx, wx);
                 sum += wz * wy * wx * fine[(z * my + y) * mx + x];

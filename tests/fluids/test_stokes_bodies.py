@@ -76,6 +76,58 @@ def test_a_body_receives_the_momentum_that_the_liquid_loses(dimension: int) -> N
     assert np.abs(bodies.bodies.velocities()).max() < 1e-6
 
 
+def test_sources_do_not_push_bodies() -> None:
+    # Faces of a source have its velocity, not that of the body that reaches into it. Otherwise the
+    # matrix has links that the residual has not, and 52 iterations reduce nothing.
+    body = {
+        "shape": "sphere",
+        "center": [0.5, 0.85],
+        "radius": 0.09,
+        "density": 400.0,
+        "wall": "sticky",
+    }
+    source = box([0.3, 0.9], [0.7, 1.0], velocity=[0.0, -1.5])
+    simulation = create(
+        small_liquids.scene(
+            size=[1.0, 1.0],
+            resolution=24,
+            liquid=[box([0.2, 0.5], [0.8, 0.9])],
+            wall="sticky",
+            solid=[body],
+            source=[source],
+            viscosity={"value": 1e3, "splitting_tolerance": ALWAYS},
+        )
+    )
+    for _ in range(4):
+        row = simulation.step(STEP)
+        assert row["stokes_error"] <= simulation.stokes.tolerance
+        assert 0 < row["stokes_iterations"] <= 20
+
+
+@pytest.mark.parametrize("share", [ALWAYS, np.inf])
+def test_a_floor_does_not_throw_bodies_that_fall_through_thick_liquid(share: float) -> None:
+    # The liquid between body and floor stops the body.
+    bodies = [
+        {"center": [0.35, 0.3], "radius": 0.09, "density": 400.0, "wall": "sticky"},
+        {"center": [0.65, 0.27], "radius": 0.08, "density": 50.0, "wall": "separating"},
+    ]
+    simulation = create(
+        small_liquids.scene(
+            size=[1.0, 1.0],
+            resolution=32,
+            liquid=[box([0.2, 0.19], [0.8, 0.6])],
+            wall="sticky",
+            solid=[{"shape": "sphere", **body} for body in bodies],
+            viscosity={"value": 4e3, "splitting_tolerance": share},
+        )
+    )
+    fastest = 0.0
+    for _ in range(18):
+        simulation.step(min(simulation.stable_dt(), 0.02))
+        fastest = max(fastest, np.abs(simulation.bodies.bodies.velocities()[:, :3]).max())
+    assert 1.0 < fastest < np.sqrt(2.0 * GRAVITY * 0.25)
+
+
 @pytest.mark.parametrize("seed", chosen([889003, 889017, *range(889023, 889040)], [889003]))
 def test_drawn_scenes_of_bodies_take_their_steps(seed: int) -> None:
     # 889003: body 2 touches walls in nearly all directions, and has left the liquid.

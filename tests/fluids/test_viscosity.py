@@ -212,6 +212,41 @@ def test_iterations_do_not_grow_with_the_grid(viscosity: int, shape: str) -> Non
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+def test_coarse_levels_do_not_overshoot_where_thick_liquid_meets_thin(dimension: int) -> None:
+    """The largest eigenvalue of the cycle times the matrix is 1, as it is for one viscosity."""
+    rng = np.random.default_rng(83 + dimension)
+    low, high = np.full(dimension, 0.28), np.full(dimension, 0.63)
+    around = [box([0.0] * dimension, [1.0, *low[1:2], *[1.0] * (dimension - 2)], viscosity=1e-2)]
+    for sides in ((0.0, low[0]), (high[0], 1.0)):
+        lower, upper = np.full(dimension, low[1]), np.full(dimension, high[1])
+        lower[0], upper[0] = sides
+        around.append(box(lower.tolist(), upper.tolist(), viscosity=1e-2))
+    simulation = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=32 if dimension == 2 else 14,
+            liquid=[box(low.tolist(), high.tolist()), *around],
+            viscosity={"value": 1e4},
+        )
+    )
+    simulation.step(0.01)
+    multigrid = simulation.viscosity.multigrid
+    multigrid.set_up()
+    diagonal = np.concatenate([d.numpy().ravel() for d in multigrid.levels[0].diagonal])
+    p, q = wp.zeros_like(multigrid.r), wp.zeros_like(multigrid.r)
+    values = rng.standard_normal(diagonal.size) * (diagonal > 0.0)
+    largest = 0.0
+    for _ in range(12):
+        p.assign((values / np.linalg.norm(values)).astype(np.float32))
+        multigrid.product(p, q)
+        wp.copy(multigrid.r, q)
+        multigrid.apply()
+        values = multigrid.z.numpy().astype(float)
+        largest = np.linalg.norm(values)
+    assert 0.5 < largest < 1.2
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_the_interpolation_is_normalized_in_its_window_only(dimension: int) -> None:
     """Values beside the window stay as they are."""
     simulation = blob(dimension)

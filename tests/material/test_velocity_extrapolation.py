@@ -4,8 +4,9 @@ import warp as wp
 
 from warp_lcp import AIR, FLUID, SOLID
 from warp_lcp.grid.staggered import StaggeredGrid, Window
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary_kernels import HELD, RELEASED
-from warp_lcp.material.velocity_extrapolation import extend_velocity
+from warp_lcp.material.velocity_extrapolation import SprayViscosity, extend_velocity
 
 GRID = StaggeredGrid((5, 6, 1), 0.1, 2, "cpu")
 CEILING = GRID.counts[1] + 1  # row of the ceiling's faces
@@ -33,7 +34,10 @@ class AirAndFluidBox:
             self.velocity[axis].assign((projected * velocity[axis]).astype(np.float32))
 
     def extend(
-        self, layers: int = 4, wall_velocity: float | None = None
+        self,
+        layers: int = 4,
+        wall_velocity: float | None = None,
+        spray: SprayViscosity | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         solid = GRID.faces() if wall_velocity is not None else []
         for field in solid[1:]:
@@ -49,6 +53,7 @@ class AirAndFluidBox:
             self.separating,
             solid,
             layers,
+            spray=spray,
         )
         u, v = (field.numpy()[1] for field in self.velocity)
         return u, v
@@ -230,3 +235,35 @@ def test_layers_end() -> None:
     u, _ = air.extend(layers=2)
     assert u[4, 3] == pytest.approx(0.5)
     assert u[5, 3] == 0.0
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.5, 1e4])
+def test_viscous_stress_acts_on_spray_that_moves_away_from_liquid(tau: float) -> None:
+    # v of the face two below the liquid, whose links are those to the face above and, once it is
+    # known, none beside: (own + tau above) / (1 + tau).
+    box = AirAndFluidBox(cells(*TOP), (0.0, 1.0))
+    own, row = -3.0, 3
+    box.velocity[1].numpy()[1, row, 3] = own
+    box.weights[1].numpy()[1, row, 3] = 1.0
+    _, v = box.extend(spray=SprayViscosity(Scalar(tau)))
+    assert v[row, 3] == pytest.approx((own + tau * 1.0) / (1.0 + tau), rel=1e-6)
+
+
+def test_spray_that_approaches_liquid_keeps_its_velocity() -> None:
+    box = AirAndFluidBox(cells(*TOP), (0.0, 1.0))
+    box.velocity[1].numpy()[1, 3, 3] = 2.5
+    box.weights[1].numpy()[1, 3, 3] = 1.0
+    _, v = box.extend(spray=SprayViscosity(Scalar(1e4)))
+    assert v[3, 3] == np.float32(2.5)
+
+
+def test_spray_of_thin_liquid_has_less_stress() -> None:
+    speeds = []
+    for relative in (1.0, 1e-3):
+        box = AirAndFluidBox(cells(*TOP), (0.0, 1.0))
+        box.velocity[1].numpy()[1, 3, 3] = -3.0
+        box.weights[1].numpy()[1, 3, 3] = 1.0
+        field = GRID.field()
+        field.fill_(relative)
+        speeds.append(box.extend(spray=SprayViscosity(Scalar(10.0), field))[1][3, 3])
+    assert speeds == pytest.approx([7.0 / 11.0, (-3.0 + 0.01) / 1.01], rel=1e-5)

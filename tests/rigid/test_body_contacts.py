@@ -51,6 +51,34 @@ def drift(bodies, duration, **settings):
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
+def test_impulses_that_lift_a_supported_body_release_it(dimension):
+    bodies = bodies_of([box([0.4, 0.0], [0.6, 0.25], dimension)], dimension)
+    run(bodies, 0.1)
+    body, kick = bodies.bodies[0], 0.01 * G
+    weight = body.properties.mass * kick
+    up = np.zeros(3 if dimension == 2 else 6)
+    up[1] = weight
+    for load, released in ((-5.0, False), (1.5, False), (2.5, True)):
+        bodies.begin_step(bodies.time, 0.01, GRAVITY, 0.01)
+        assert body.hold is not None
+        body.apply_impulse(load * up)
+        before = body.state(), body.received_impulse.copy()
+        assert bodies.release_lifted(kick) == released
+        if released:
+            # It falls, as without contacts, and has received nothing.
+            assert body.hold is None and not body.received_impulse.any()
+            assert body.momentum[1] == pytest.approx(-weight)
+            body.apply_impulse(load * up)
+        else:
+            assert body.hold is not None
+            assert (body.state() == before[0]).all()
+            assert (body.received_impulse == before[1]).all()
+        bodies.solve_contacts()
+        assert body.velocity[1] == pytest.approx(max(load - 1.0, 0.0) * kick, abs=1e-6)
+        bodies.restore_step()
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
 def test_a_dropped_box_rests_on_the_floor_without_drift(dimension):
     bodies = bodies_of([box([0.4, 0.1], [0.6, 0.25], dimension)], dimension)
     run(bodies, 1.0)

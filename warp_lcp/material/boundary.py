@@ -29,6 +29,7 @@ from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material import boundary_kernels as kernels
 from warp_lcp.material.velocity_extrapolation import (
     LayerCallback,
+    SprayViscosity,
     extend_velocity,
     extend_velocity_cut,
 )
@@ -89,10 +90,11 @@ class Boundary(Protocol):
         contact: wp.array,
         layers: int,
         join: LayerCallback | None = None,
+        spray: SprayViscosity | None = None,
     ) -> None:
         """Extrapolate the projected velocity into air and walls.
 
-        See `warp_lcp.material.velocity_extrapolation`, also for `join`.
+        See `warp_lcp.material.velocity_extrapolation`, also for `join` and `spray`.
         """
 
     def placed(self) -> list[wp.array]:
@@ -220,6 +222,7 @@ class WholeCells:
         contact: wp.array,
         layers: int,
         join: LayerCallback | None = None,
+        spray: SprayViscosity | None = None,
     ) -> None:
         """Extrapolate the projected velocity into air and walls."""
         s = self.solids
@@ -234,6 +237,7 @@ class WholeCells:
             s.separating,
             self.velocity,
             layers,
+            spray=spray,
             join=join,
         )
 
@@ -379,6 +383,7 @@ class CutBoundary:
         contact: wp.array,
         layers: int,
         join: LayerCallback | None = None,
+        spray: SprayViscosity | None = None,
     ) -> None:
         """Extrapolate the projected velocity into air and walls."""
         extend_velocity_cut(
@@ -391,6 +396,7 @@ class CutBoundary:
             self.cut,
             self._scratch,
             layers,
+            spray=spray,
             join=join,
         )
 

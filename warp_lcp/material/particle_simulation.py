@@ -34,7 +34,7 @@ from warp_lcp.material.particle_scene import ParticleScene
 from warp_lcp.material.particle_state import particle_trouble
 from warp_lcp.material.sources import Drain, Outlets, Source
 from warp_lcp.material.spray import Spray
-from warp_lcp.material.velocity_extrapolation import LayerCallback
+from warp_lcp.material.velocity_extrapolation import LayerCallback, SprayViscosity
 from warp_lcp.rigid.bodies import RigidBodies
 from warp_lcp.simulation import NoStopwatch, SimulationFailed, StepFailed, Stopwatch
 
@@ -119,9 +119,11 @@ class ParticleSimulation(ParticleCheckpoints):
             that is read with them.
         vicinity: active row segments, the cells that a step must visit; None for all cells around
             the particles.
+        spray_viscosity: viscous stress on spray beside the material; None without viscosity.
     """
 
     vicinity: ActiveRows | None = None
+    spray_viscosity: SprayViscosity | None = None
 
     def __init__(
         self,
@@ -504,7 +506,15 @@ class ParticleSimulation(ParticleCheckpoints):
         `join` is called after each layer.
         """
         self.boundary.extrapolate_velocity(
-            window, self.velocity, self.weights, known, kind, contact, self.layers, join
+            window,
+            self.velocity,
+            self.weights,
+            known,
+            kind,
+            contact,
+            self.layers,
+            join,
+            self.spray_viscosity,
         )
 
     def _layer_filled(self) -> LayerCallback | None:

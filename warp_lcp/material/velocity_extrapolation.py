@@ -5,7 +5,8 @@ but no more than the mean of the projected faces around them. (Extrapolated valu
 everything that rests at a wall after the one particle that leaves it. Their own velocity alone
 would let a cell's worth of a full box fall.) 1. One layer is extrapolated from the projected faces.
 2. Faces between AIR cells with particle weight keep their own velocity: extrapolating over spray
-would make a droplet hang above a pool. 3. Further layers are extrapolated from all of them. Closed
+would make a droplet hang above a pool. If the material is viscous, its stress slows them first, see
+`SprayViscosity`. 3. Further layers are extrapolated from all of them. Closed
 faces are included and now have the material's velocity, not the wall's. 4. Held cells set their
 closed faces to the wall's normal velocity (not merely less of the inward one: a moving wall drags
 its material along). Released and AIR cells lose only the part into the wall, so that the last
@@ -30,12 +31,13 @@ from pathlib import Path
 import warp as wp
 
 from warp_lcp.grid.advection import FaceVelocity
-from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel
+from warp_lcp.grid.cell_kernel import F32, I8, I32, U8, cell_below, cell_kernel, next_to
 from warp_lcp.grid.cut_cells import CutCells
 from warp_lcp.grid.extrapolate import BLOCKED, extrapolate
 from warp_lcp.grid.staggered import Window, three_components
 from warp_lcp.grid.transfer import TINY_WEIGHT
 from warp_lcp.kernels import KernelFile
+from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.material.boundary_kernels import HELD, RELEASED, TOUCHES_NOTHING
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 
@@ -54,6 +56,7 @@ _CONSTANTS = {"TINY_WEIGHT": TINY_WEIGHT, "DEPTH": DEPTH, "SOLID": SOLID, "FLUID
 KERNELS = KernelFile(Path(__file__).parent / "headers/wall.h", _CONSTANTS)
 KEEP_SPRAY = KERNELS["warp_lcp.material.velocity_extrapolation.keep_spray"]
 _FLUID = wp.constant(wp.int8(FLUID))
+_SOLID = wp.constant(wp.int8(SOLID))
 
 
 @cell_kernel("warp_lcp.material.velocity_extrapolation")
@@ -134,6 +137,124 @@ def closed_face_kernel(
             field[k, j, i] = target
 
 
+@cell_kernel("warp_lcp.material.velocity_extrapolation")
+@typing.no_type_check
+def viscous_spray_kernel(
+    k,
+    j,
+    i,
+    axis: int,
+    layer: int,
+    strength: float,
+    relative: F32,
+    kind: I8,
+    open: F32,
+    apart: U8,
+    weight: F32,
+    field: F32,
+    known: I8,
+):
+    """Apply viscous stress to open faces with weight beside faces known up to `layer`.
+
+    They are marked layer + 1, see `SprayViscosity`.
+
+    Args:
+        k: plane of the face.
+        j: row of the face.
+        i: place in its row.
+        axis: component of the velocity.
+        layer: largest mark of the faces whose velocity is read.
+        strength: tau of a relative viscosity of 1.
+        relative: relative viscosity of cells, or an empty array if it is 1.
+        kind: AIR, FLUID, SOLID.
+        open: open fractions of the component's faces, or an empty array without cut cells.
+        apart: bit d is set if a thin solid lies between this face and the one below along axis d.
+        weight: weights of the particles.
+        field: the component [m/s] (updated).
+        known: marks (updated).
+    """
+    # A face with weight is not on the array's edge.
+    if known[k, j, i] == wp.int8(0) and weight[k, j, i] > TINY_WEIGHT:
+        c, b, a = cell_below(axis, k, j, i)
+        free = kind[k, j, i] != _SOLID and kind[c, b, a] != _SOLID
+        if open:
+            free = open[k, j, i] > 0.0
+        if free:
+            own = field[k, j, i]
+            total = float(0.0)
+            links = float(0.0)
+            beside = int(0)
+            for n in range(6):
+                d = n >> 1
+                side = 2 * (n & 1) - 1
+                z, y, x = next_to(d, side, k, j, i)
+                if z >= 0 and z < known.shape[0] and y < known.shape[1] and x < known.shape[2]:
+                    mark = int(known[z, y, x])
+                    divided = int(0)
+                    if apart:
+                        divided = int(apart[wp.max(z, k), wp.max(y, j), wp.max(x, i)]) >> d & 1
+                    if mark > 0 and mark <= layer and divided == 0:
+                        beside += 1
+                        u = field[z, y, x]
+                        # Material that comes closer along the axis moves on until it has arrived.
+                        if d != axis or float(side) * (own - u) < 0.0:
+                            total += u
+                            links += 1.0
+            if beside > 0:
+                tau = strength
+                if relative:
+                    tau *= 0.5 * (relative[k, j, i] + relative[c, b, a])
+                field[k, j, i] = (own + tau * total) / (1.0 + tau * links)
+                known[k, j, i] = wp.int8(layer + 1)
+
+
+SPRAY_LAYERS = 2  # layers of faces that particles in AIR cells beside liquid reach, after the first
+
+
+@dataclass(frozen=True, slots=True)
+class SprayViscosity:
+    """Viscous stress on faces between AIR cells that carry particles.
+
+    Such particles, as those at the corners of a thread's tip, are no unknowns of the viscous solve.
+    Gravity alone would tear them off, however thick the liquid is. A face with the velocity u* and
+    the mass of a cell is linked to the faces g beside it that are known:
+
+        u - u* + tau sum_g (u - u_g) = 0,   tau = nu dt / dx^2,
+
+    in one implicit step of each layer, outwards. Links to faces ahead that it approaches are left
+    out: a droplet above a pool would hang there.
+
+    Attributes:
+        strength: tau of a relative viscosity of 1.
+        relative: relative viscosity of cells; None if it is 1.
+    """
+
+    strength: Scalar
+    relative: wp.array | None = None
+
+    def act(
+        self,
+        window: Window,
+        axis: int,
+        velocity: wp.array,
+        weight: wp.array,
+        known: wp.array,
+        kind: wp.array,
+        *,
+        open_fraction: wp.array | None = None,
+        apart: wp.array | None = None,
+        join: LayerCallback | None = None,
+    ) -> None:
+        """Update a component after the first extrapolated layer; arguments as of the kernel."""
+        for layer in range(2, 2 + SPRAY_LAYERS):
+            fields = [kind, open_fraction, apart, weight, velocity, known]
+            window.launch(
+                viscous_spray_kernel, [axis, layer, self.strength, self.relative, *fields]
+            )
+            if join is not None:
+                join(known, velocity)
+
+
 def extend_velocity(
     window: Window,
     velocity: Sequence[wp.array],
@@ -146,6 +267,7 @@ def extend_velocity(
     solid_velocity: Sequence[wp.array],
     layers: int,
     *,
+    spray: SprayViscosity | None = None,
     join: LayerCallback | None = None,
 ) -> None:
     """Extrapolate the projected velocity into air and walls.
@@ -164,12 +286,15 @@ def extend_velocity(
         solid_velocity: velocity of the solids on each component's faces [m/s], or empty if all
             stand still.
         layers: number of layers of faces to fill in the air.
+        spray: viscous stress on spray beside liquid; None if the material has none.
         join: called with the marks and the velocity of a component after each layer, see
             `warp_lcp.grid.extrapolate`.
     """
     for axis, (field, weight, marks) in enumerate(zip(velocity, weights, known, strict=True)):
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         extrapolate(window, marks, field, 1, join=join)
+        if spray is not None:
+            spray.act(window, axis, field, weight, marks, kind, join=join)
         window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=None)
         if join is not None:
             join(marks, field)
@@ -252,6 +377,7 @@ def extend_velocity_cut(
     scratch: Sequence[wp.array],
     layers: int,
     *,
+    spray: SprayViscosity | None = None,
     join: LayerCallback | None = None,
 ) -> None:
     """Extrapolate the projected velocity into air and walls that cut cells.
@@ -268,6 +394,18 @@ def extend_velocity_cut(
         window.launch(keep_released_kernel, [axis, kind, contact, weight, field, marks])
         apart = barriers.apart[axis] if barriers is not None else None
         extrapolate(window, marks, field, 1, join=join, apart=apart)
+        if spray is not None:
+            spray.act(
+                window,
+                axis,
+                field,
+                weight,
+                marks,
+                kind,
+                open_fraction=fraction,
+                apart=apart,
+                join=join,
+            )
         window.run(KEEP_SPRAY, axis=axis, known=marks, weight=weight, kind=kind, open=fraction)
         extrapolate(window, marks, field, layers, join=join, apart=apart)
     if barriers is not None:

@@ -30,6 +30,7 @@ class _StepStart:
     Args:
         states: states of the bodies before the step.
         free: momenta without contacts, shape (n, 6).
+        supported: momenta with contacts, without the material, shape (n, 6).
         contacts: contacts of the bodies.
         impulses: impulses of the contacts without the material; once `settled` is set, including
             it.
@@ -41,6 +42,7 @@ class _StepStart:
 
     states: np.ndarray
     free: np.ndarray
+    supported: np.ndarray
     contacts: Contacts
     impulses: np.ndarray
     detour: np.ndarray | None
@@ -154,6 +156,7 @@ class RigidBodies:
         self._begun = _StepStart(
             states,
             free,
+            self._momenta(),
             contacts,
             impulses,
             self._solve.detour(contacts, before, impulses),
@@ -177,11 +180,7 @@ class RigidBodies:
             raise RuntimeError("solve_contacts: call begin_step first")
         impulses = pending.impulses
         if self.bodies.received_impulse.any():
-            momenta = pending.free + self.bodies.received_impulse
-            self.bodies.momentum[:], self.bodies.angular_momentum[:] = (
-                momenta[:, :3],
-                momenta[:, 3:],
-            )
+            self._set_momenta(pending.free + self.bodies.received_impulse)
             impulses = self._solve.push_apart(
                 pending.contacts, pending.impulses, dt=pending.dt, kick_dt=pending.kick_dt
             )
@@ -192,6 +191,7 @@ class RigidBodies:
         self._begun = _StepStart(
             pending.states,
             pending.free,
+            pending.supported,
             pending.contacts,
             impulses,
             pending.detour,
@@ -200,6 +200,51 @@ class RigidBodies:
             True,
         )
         self.contact_residual = self._ranks.share(self.contact_residual)
+
+    def release_lifted(self, speed: float) -> bool:
+        """Release supported bodies that the material lifts off their supports.
+
+        The material has been solved with bodies that contacts hold. Contacts push, but do not pull:
+        a body that approaches a floor through thick liquid would be held at its velocity against
+        the pressure that stops it, and then be thrown back by the impulse of that pressure. The
+        material is to be solved again, with the released bodies free. All bodies are then as after
+        `begin_step`, without impulses of the material.
+
+        Args:
+            speed: least change of a body's velocity, anywhere on it, for a release [m/s].
+
+        Returns:
+            Whether bodies have been released.
+
+        Raises:
+            RuntimeError: there was no `begin_step`.
+        """
+        pending = self._begun
+        if pending is None:
+            raise RuntimeError("release_lifted: call begin_step first")
+        held = np.array([body.hold is not None for body in self.bodies])
+        if not (held.any() and self.bodies.received_impulse.any()):
+            return bool(self._ranks.share(False))
+        momenta, assumed = self._momenta(), self.bodies.velocities()
+        self._set_momenta(pending.free + self.bodies.received_impulse)
+        times = {"dt": pending.dt, "kick_dt": pending.kick_dt}
+        self._solve.push_apart(pending.contacts, pending.impulses, **times)
+        change = self.bodies.velocities() - assumed
+        sizes = lengths(change[:, :3]) + self._solve.reach * lengths(change[:, 3:])
+        lifted = self._ranks.share(held & (sizes > speed))
+        self._set_momenta(momenta)
+        if not lifted.any():
+            return False
+        self._set_momenta(np.where(lifted[:, None], pending.free, pending.supported))
+        self.bodies.received_impulse[:] = 0.0
+        for body, released in zip(self.bodies, lifted, strict=True):
+            body.hold = None if released else body.hold
+        return True
+
+    def _set_momenta(self, momenta: np.ndarray) -> None:
+        """Set the momenta of the bodies, shape (n, 6)."""
+        self.bodies.momentum[:] = momenta[:, :3]
+        self.bodies.angular_momentum[:] = momenta[:, 3:]
 
     def end_step(self, dt: float) -> None:
         """Move the bodies; calls `solve_contacts` if it has not been called.
