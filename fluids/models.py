@@ -229,9 +229,11 @@ def make_stokes(
 ) -> StokesSolve | None:
     """Return the coupled solve of velocity and pressure of a scene, or None.
 
-    Ranks have none.
+    On several ranks, scenes with rigid bodies have none.
     """
-    if scene.viscosity is None or viscosity is None or not scene.couples or grid.part.shared:
+    if scene.viscosity is None or viscosity is None or not scene.couples:
+        return None
+    if grid.part.shared and bodies is not None:
         return None
     return StokesSolve(
         grid,

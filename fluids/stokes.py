@@ -88,7 +88,7 @@ class StokesResult:
 
 
 class StokesSolve:
-    """Coupled solves of velocity and pressure, see the module.
+    """Coupled solves of velocity and pressure, see the module; its solves are collective.
 
     GMRES, started from the split step's result, is preconditioned from the right. Residuals are
     measured with reciprocal diagonals as weights. The preconditioner's energy norm of a residual
@@ -98,7 +98,7 @@ class StokesSolve:
     y when the residual has fallen to a tenth.
 
     Args:
-        grid: the grid, of one process.
+        grid: the grid.
         boundary: solids and walls.
         viscosity: the viscous solve, whose equations are used.
         projection: the pressure, whose cells, bounds and matrix are used.
@@ -224,13 +224,14 @@ class StokesSolve:
         components = multigrid.components
         p, q = multigrid.r, self._viscosity.change_field
         for axis, part in enumerate(components(p)):
-            operator.window.run(
+            operator.faces.run(
                 operator.kernels.difference,
                 out=part,
                 a=velocity[axis],
                 b=self._saved[axis],
                 volume=operator.level.volume[axis],
             )
+        self._grid.part.fill(*components(p))
         clear(q)
         multigrid.product(p, q, launch=launch_recorded)
         operator.take_energy(self._difference, components(p), components(q))
@@ -249,6 +250,7 @@ class StokesSolve:
                 restart=VECTORS,
                 weight=weight,
                 at_once=self.operator.bodies is not None,
+                comm=self._grid.part.comm,
             )
             self._split_pressure = self._grid.field(wp.float64)
         return self._krylov
@@ -329,10 +331,10 @@ class StokesSolve:
         operator = self.operator
         operator.launch_set_up(kind, contact)
         for axis, (u, last) in enumerate(zip(velocity, self._last, strict=True)):
-            operator.window.run(
+            operator.faces.run(
                 operator.kernels.start_velocity, u=u, other=last, volume=operator.level.volume[axis]
             )
-        operator.window.run(
+        operator.cells.run(
             operator.kernels.start_pressure,
             x=self._projection.pressure,
             other=self._last_pressure,
@@ -340,6 +342,7 @@ class StokesSolve:
             other_kind=self._last_cells,
             ratio=self._ratio,
         )
+        self._grid.part.fill(*velocity, self._projection.pressure)
 
     def _splitting_error(self) -> float:
         """Return an estimate of |u - u2|_V, see `couple_from_last`."""
@@ -354,13 +357,15 @@ class StokesSolve:
         """Write x - x1, without velocities, to a vector."""
         operator, work = self.operator, self._preconditioner.work
         clear(work)
-        operator.window.run(
+        difference = operator.layout.pressure(work)
+        operator.cells.run(
             operator.kernels.pressure_difference,
-            out=operator.layout.pressure(work),
+            out=difference,
             x=self._projection.pressure,
             other=self._split_pressure,
             kind=self._projection.kind,
         )
+        self._grid.part.fill(difference)
 
     def _iterate(
         self,
@@ -442,15 +447,16 @@ class StokesSolve:
         """Add a correction to velocity and pressure."""
         operator, layout = self.operator, self.operator.layout
         for axis, (u, part) in enumerate(zip(velocity, layout.components(more), strict=True)):
-            operator.window.run(
+            operator.faces.run(
                 operator.kernels.add_velocity, u=u, more=part, volume=operator.level.volume[axis]
             )
-        operator.window.run(
+        operator.cells.run(
             operator.kernels.add_pressure,
             x=self._projection.pressure,
             more=layout.pressure(more),
             free=operator.free,
         )
+        self._grid.part.fill(*velocity, self._projection.pressure)
 
     def _save(self, velocity: Sequence[wp.array]) -> None:
         """Store the split step's result."""
