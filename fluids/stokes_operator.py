@@ -230,7 +230,7 @@ class StokesOperator:
         )
         copy(level.cell, self._cell)
         copy(level.mixed, self._mixed)
-        grid.part.fill(level.cell, level.mixed, *level.volume)
+        grid.part.fill(level.cell, level.mixed, self.contact, *level.volume)
         for (one, other), edge in level.edges.items():
             self.faces.run(
                 kernels.edges,
@@ -242,10 +242,11 @@ class StokesOperator:
                 a=one,
                 b=other,
             )
+        grid.part.fill(*level.edges.values())
         self.viscosity.set_diagonals(kind, self.contact)
-        fields = [self.contact, self._products, self._across, *self.leak, *self.share]
+        fields = [self._products, self._across, *self.leak, *self.share]
         fields += [] if self.bodies is None else self.bodies.free_parts
-        weights = [*level.edges.values(), *level.drag, *level.hold, *level.diagonal]
+        weights = [*level.drag, *level.hold, *level.diagonal]
         grid.part.fill(*weights, *(field for field in fields if field is not None))
 
     # Matrix
