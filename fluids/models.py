@@ -227,13 +227,8 @@ def make_stokes(
     projection: PressureProjection,
     bodies: RigidBodies | None,
 ) -> StokesSolve | None:
-    """Return the coupled solve of velocity and pressure of a scene, or None.
-
-    On several ranks, scenes with rigid bodies have none.
-    """
+    """Return the coupled solve of velocity and pressure of a scene, or None."""
     if scene.viscosity is None or viscosity is None or not scene.couples:
-        return None
-    if grid.part.shared and bodies is not None:
         return None
     return StokesSolve(
         grid,

@@ -416,7 +416,8 @@ class StokesSolve:
                 iterations += added
                 self._graphs["_launch_corrections"].run(velocity, krylov.x)
                 if operator.bodies is not None:
-                    operator.bodies.move(operator.layout.bodies(krylov.x))
+                    change = self._grid.part.ranks.share(operator.layout.bodies(krylov.x))
+                    operator.bodies.move(change)
                     moved()
                 switched = operator.find_free_cells(velocity, LOOK)
                 settled = not switched

@@ -257,8 +257,8 @@ class StokesOperator:
         if self.bodies is not None:
             V = self.layout.bodies(p)
             self.bodies.add_forces(V, q)
-            self.bodies.add_outflow(V, self.layout.flat_pressure(q), self.free.flatten(), sign=-1.0)
-            self.layout.set_bodies(q, self.bodies.rows(V, p, self.layout.flat_pressure(p)))
+            self.bodies.add_outflow(V, self.layout.pressure(q), self.free, sign=-1.0)
+            self.layout.set_body_rows(q, self.bodies.rows(V, p, self.layout.pressure(p)))
 
     def _launch_product(self, p: wp.array, q: wp.array) -> None:
         """Write q = K p without bodies."""
@@ -383,9 +383,8 @@ class StokesOperator:
         if self.bodies is not None:
             for part, u in zip(self.layout.components(work), velocity, strict=True):
                 copy(part, u)
-            x = self.projection.pressure.flatten()
-            rows = self.bodies.rows(self.bodies.velocities, work, x)
-            self.layout.set_bodies(r, self.bodies.start - rows)
+            rows = self.bodies.rows(self.bodies.velocities, work, self.projection.pressure)
+            self.layout.set_body_rows(r, self.bodies.start - rows)
 
     def _launch_held(self, velocity: Sequence[wp.array]) -> None:
         """Update the velocity of faces in walls that are partly open."""
@@ -414,7 +413,7 @@ class StokesOperator:
         if self.bodies is not None:
             for part, u in zip(self.layout.components(work), velocity, strict=True):
                 copy(part, u)
-            self.bodies.apply_impulses(work, self.projection.pressure.flatten())
+            self.bodies.apply_impulses(work, self.projection.pressure)
 
     def _launch_residual(self, velocity: Sequence[wp.array], residual: wp.array) -> None:
         """Write the residual from the viscous force and the outflow, without bodies."""

@@ -73,7 +73,7 @@ class StokesPreconditioner:
         clear(self.weight, operator.free)
         if operator.bodies is not None:
             operator.bodies.update(operator.level, operator.viscous_walls, velocity)
-            self.layout.set_bodies(self.weight, operator.bodies.weights)
+            self.layout.set_body_rows(self.weight, operator.bodies.weights)
         self._graphs["_launch_set_up"].run()
 
     def _launch_set_up(self) -> None:
@@ -129,12 +129,14 @@ class StokesPreconditioner:
         """Write z = P r, see the class; GMRES calls it."""
         self._graphs["_launch_velocities"].run(self._viscous_cycle)
         if self.operator.bodies is not None:
-            r_bodies = self.layout.bodies(self.r)
+            r_bodies = self.layout.body_rows(self.r)
             z_bodies = self.operator.bodies.corrected(r_bodies, self.z)
             self._square_of_bodies = self.operator.bodies.square(z_bodies, r_bodies)
             self.layout.set_bodies(self.z, z_bodies)
             self._graphs["_launch_right_side"].run()
-            self.operator.bodies.add_outflow(z_bodies, self._pressure.r, self._free_cells, sign=1.0)
+            self.operator.bodies.add_outflow(
+                z_bodies, self._right_side, self.operator.free, sign=1.0
+            )
         self._graphs["_launch_pressures"].run(self._pressure.program)
 
     def viscous_norm(self) -> float:
@@ -147,7 +149,7 @@ class StokesPreconditioner:
         square = self._squares.read()[0] - self.operator.kinetic_energy(u)
         bodies = self.operator.bodies
         if bodies is not None:
-            r_bodies = self.layout.bodies(self.r)
+            r_bodies = self.layout.body_rows(self.r)
             z_bodies = bodies.corrected(r_bodies, self.z)
             square += bodies.square(z_bodies, r_bodies - z_bodies)
         return math.sqrt(max(square, 0.0))
@@ -183,11 +185,9 @@ class StokesPreconditioner:
 
     def _launch_right_side(self) -> None:
         """Write the right-hand side of the pressure's cycle, r_x + D z_u without bodies."""
-        x, work = self.layout.flat_pressure(self.z), self.layout.pressure(self.work)
+        x, work = self.layout.pressure(self.z), self.layout.pressure(self.work)
         clear(x)
-        self.operator.minus_outflow(
-            self.layout.components(self.z), x.reshape(self.operator.grid.shape), work
-        )
+        self.operator.minus_outflow(self.layout.components(self.z), x, work)
         self.operator.cells.run(
             self.operator.kernels.right_side,
             out=self._right_side,

@@ -17,7 +17,8 @@ from warp_lcp.kernels.launch_graph import LaunchGraph
 class StokesLayout:
     """Parts of a vector of the coupled solve, see `fluids.stokes_operator`.
 
-    Velocities of all components, x of all cells, and the velocities of rigid bodies.
+    Velocities of all components, x of all cells, and the velocities of rigid bodies. All ranks know
+    these, but the first one has their rows: residuals and weights are 0 on the others.
 
     Args:
         grid: the grid.
@@ -42,13 +43,9 @@ class StokesLayout:
         """Return the velocities, of each component in the stored shape."""
         return self._multigrid.components(vector)
 
-    def flat_pressure(self, vector: wp.array) -> wp.array:
-        """Return x, a flat field."""
-        return vector[self._pressures]
-
     def pressure(self, vector: wp.array) -> wp.array:
         """Return x in the stored shape."""
-        return self.flat_pressure(vector).reshape(self._grid.shape)
+        return vector[self._pressures].reshape(self._grid.shape)
 
     def bodies(self, vector: wp.array) -> np.ndarray:
         """Return the velocities of the bodies, a copy."""
@@ -57,6 +54,14 @@ class StokesLayout:
     def set_bodies(self, vector: wp.array, values: np.ndarray) -> None:
         """Store the velocities of the bodies."""
         vector[self._bodies].assign(values.astype(np.float32))
+
+    def body_rows(self, vector: wp.array) -> np.ndarray:
+        """Return the rows of the bodies in a residual, a copy; collective."""
+        return np.asarray(self._grid.part.ranks.sum(self.bodies(vector)))
+
+    def set_body_rows(self, vector: wp.array, values: np.ndarray) -> None:
+        """Store the rows of the bodies in a residual or in weights."""
+        self.set_bodies(vector, values * self._grid.part.ranks.is_root)
 
 
 def launch_graphs(
