@@ -157,6 +157,8 @@ class StokesSolve:
         self._share, self._steps_to_estimate = 0.0, 0  # the last estimate, see `couple_from_last`
         self.continues = False
         self._last = grid.faces()  # velocity at the end of the last coupled step
+        part = grid.part
+        self._has_open_sides = part.ranks.any(bool(boundary.open_sides & ~part.cuts))
         self._last_pressure, self._last_cells = grid.field(wp.float64), grid.field(wp.int8)
         self._last_bodies = np.zeros(self.operator.layout.rank)
         self._ratio = Scalar(1.0)  # of the times that forces act in this step and the last one
@@ -477,9 +479,16 @@ class StokesSolve:
             moved()
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state: where the next step begins."""
+        """Return the state: where the next step begins.
+
+        Pieces of a state have the cells of the domain alone. If a side of the domain is open,
+        velocities of the upper faces of the cells follow those of the lower ones.
+        """
+        velocity = [u.numpy() for u in self._last]
+        if self._has_open_sides:
+            velocity += [np.roll(u, -1, axis=2 - axis) for axis, u in enumerate(velocity)]
         return {
-            "coupled_velocity": np.stack([u.numpy() for u in self._last]),
+            "coupled_velocity": np.stack(velocity),
             "coupled_bodies": self._last_bodies.copy(),
             "coupled": np.array(
                 [self.continues, self._steps_to_estimate, self._share], dtype=float
@@ -488,7 +497,11 @@ class StokesSolve:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore `state`, whose arrays have been checked."""
-        for u, values in zip(self._last, state["coupled_velocity"], strict=True):
+        velocity = np.array(state["coupled_velocity"])
+        lower, upper = np.split(velocity, [len(self._last)])
+        for axis, values in enumerate(upper):
+            np.moveaxis(lower[axis], 2 - axis, 0)[-1] = np.moveaxis(values, 2 - axis, 0)[-2]
+        for u, values in zip(self._last, lower, strict=True):
             u.assign(values)
         self._last_bodies = np.array(state["coupled_bodies"])
         continues, steps, self._share = (float(v) for v in state["coupled"])

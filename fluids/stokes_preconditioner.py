@@ -57,10 +57,7 @@ class StokesPreconditioner:
         self._squares = WindowSums(kernels.velocity_correction, grid, grid.dimension)
         self._pressure_square = WindowSums(kernels.correction, grid)
         self._graphs = launch_graphs(
-            grid.device,
-            self._launch_velocities,
-            self._launch_right_side,
-            self._launch_pressures,
+            grid.device, self._launch_velocities, self._launch_right_side, self._launch_pressures
         )
         # The viscous multigrid of ranks is set up by the host.
         set_up = launch_graphs(grid.device, self._launch_set_up, at_once=grid.part.shared)

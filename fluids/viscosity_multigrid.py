@@ -115,10 +115,7 @@ class ViscosityMultigrid:
         gather = Launches(partial(perform, partial(part.collect, last.b, first.b)))
         copy_part = Launches(partial(perform, partial(_copy_part, last, first)))
         return GatheredLevel(
-            whole=lambda projected: whole,
-            gather=[gather],
-            gather_bounds=[],
-            copy_part=copy_part,
+            whole=lambda projected: whole, gather=[gather], gather_bounds=[], copy_part=copy_part
         ).solve
 
     def components(self, field: wp.array) -> list[wp.array]:
