@@ -227,11 +227,8 @@ def make_stokes(
     projection: PressureProjection,
     bodies: RigidBodies | None,
 ) -> StokesSolve | None:
-    """Return the coupled solve of velocity and pressure of a scene, or None.
-
-    Ranks have none.
-    """
-    if scene.viscosity is None or viscosity is None or not scene.couples or grid.part.shared:
+    """Return the coupled solve of velocity and pressure of a scene, or None."""
+    if scene.viscosity is None or viscosity is None or not scene.couples:
         return None
     return StokesSolve(
         grid,

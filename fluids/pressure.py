@@ -622,6 +622,7 @@ class PressureProjection:
             residual: norm of the outflow at which the solve ends [m/s].
             moved: called when the velocities of bodies have changed.
         """
+        part = self.grid.part
         if self._before is None:
             self._before = self.grid.field(wp.float64)
         before = self._before
@@ -631,8 +632,12 @@ class PressureProjection:
         if self._lower is None:
             clear(self._start)
         else:
-            self._problem.A.apply(before, self._start)
+            box, guess = part.box_like(before), self._guess.reshape(self._rhs.shape)
+            part.copy_to_box(before, box)
+            self._problem.A.apply(box, guess)
+            part.copy_from_box(guess, self._start)
             self._cells.run(LAST_RIGHT_SIDE, b=self._b, start=self._start, x=before)
+        self._copying.run()
         criteria = wl.StoppingCriteria(rtol=0.0, atol=residual, max_iterations=self.max_iterations)
         result = wl.solve(
             self._problem, self.solver, stopping=criteria, x0=self._guess, workspace=self._work
@@ -640,11 +645,13 @@ class PressureProjection:
         if self._lower is not None:
             self._store_pressure(result.x)
             self._cells.run(CHANGE, out=self._start, x=self.pressure, before=before, kind=self.kind)
-            result = replace(result, x=self._start)
+            part.copy_to_box(self._start, self._guess)
+            result = replace(result, x=self._guess)
         self.push_bodies(result)
         moved()
         projected = self.project(velocity, window, result, criteria)
         self._cells.run(SUM_PRESSURE, x=self.pressure, before=before, kind=self.kind)
+        part.fill(self.pressure)
         self._contacts.launch(
             self._cells,
             self._faces,
@@ -655,7 +662,7 @@ class PressureProjection:
             threshold=self._threshold,
         )
         self._contacts.changed()
-        self.grid.part.fill(self.contact)
+        part.fill(self.contact)
         return projected
 
     def counted(self) -> int:

@@ -100,14 +100,6 @@ class SurfaceTensionSettings(Table):
     )
 
 
-def split_note(where: str) -> str:
-    """Return the note that pressure and viscosity are not solved at once."""
-    return (
-        f"viscosity.splitting_tolerance has no effect {where}: pressure and viscosity act one "
-        "after the other"
-    )
-
-
 def _viscosity(shape: Shape) -> float | None:
     """Return the viscosity of a material or source [Pa s]; None for the default."""
     return shape.viscosity if isinstance(shape, LiquidProperties | SourceProperties) else None
@@ -181,10 +173,6 @@ class LiquidScene(ParticleScene):
             *self._viscosity_errors(),
             *probe_errors(self.probe, self.domain.size, self.physics.gravity),
         ]
-
-    def rank_notes(self) -> list[str]:
-        """Return notes on settings without effect on several ranks."""
-        return [split_note("on several ranks")] if self.couples else []
 
     def notes(self) -> list[str]:
         """Return suspicious settings."""

@@ -24,7 +24,7 @@ from warp_lcp.fluids.models import (
 )
 from warp_lcp.fluids.pressure import Projection
 from warp_lcp.fluids.probes import Probes
-from warp_lcp.fluids.scene import LiquidScene, split_note
+from warp_lcp.fluids.scene import LiquidScene
 from warp_lcp.fluids.stokes import STOKES_COLUMNS, StokesSolve
 from warp_lcp.fluids.surface_tension import REACH
 from warp_lcp.fluids.viscosity import VISCOUS_COLUMNS, Viscosity
@@ -110,9 +110,11 @@ class LiquidSimulation(ParticleSimulation):
             self.layers, 2 * scene.pressure.smoothing, 0 if self.tension is None else REACH
         )
         self.measured: dict[str, Row] = {}
-        if self.scene.couples and (self.stokes is None or self.stokes.unsupported):
-            where = "on several ranks" if self.stokes is None else "with bodies thinner than a cell"
-            self._notes.append(split_note(where))
+        if self.stokes is not None and self.stokes.unsupported:
+            self._notes.append(
+                "viscosity.splitting_tolerance has no effect with bodies thinner than a cell: "
+                "pressure and viscosity act one after the other"
+            )
         if self.tension is not None:
             longest = self.tension.longest_step()
             self._notes.append(f"surface tension: steps of at most {longest:.3g} s")

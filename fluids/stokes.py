@@ -88,7 +88,7 @@ class StokesResult:
 
 
 class StokesSolve:
-    """Coupled solves of velocity and pressure, see the module.
+    """Coupled solves of velocity and pressure, see the module; its solves are collective.
 
     GMRES, started from the split step's result, is preconditioned from the right. Residuals are
     measured with reciprocal diagonals as weights. The preconditioner's energy norm of a residual
@@ -98,7 +98,7 @@ class StokesSolve:
     y when the residual has fallen to a tenth.
 
     Args:
-        grid: the grid, of one process.
+        grid: the grid.
         boundary: solids and walls.
         viscosity: the viscous solve, whose equations are used.
         projection: the pressure, whose cells, bounds and matrix are used.
@@ -157,6 +157,8 @@ class StokesSolve:
         self._share, self._steps_to_estimate = 0.0, 0  # the last estimate, see `couple_from_last`
         self.continues = False
         self._last = grid.faces()  # velocity at the end of the last coupled step
+        part = grid.part
+        self._has_open_sides = part.ranks.any(bool(boundary.open_sides & ~part.cuts))
         self._last_pressure, self._last_cells = grid.field(wp.float64), grid.field(wp.int8)
         self._last_bodies = np.zeros(self.operator.layout.rank)
         self._ratio = Scalar(1.0)  # of the times that forces act in this step and the last one
@@ -224,13 +226,14 @@ class StokesSolve:
         components = multigrid.components
         p, q = multigrid.r, self._viscosity.change_field
         for axis, part in enumerate(components(p)):
-            operator.window.run(
+            operator.faces.run(
                 operator.kernels.difference,
                 out=part,
                 a=velocity[axis],
                 b=self._saved[axis],
                 volume=operator.level.volume[axis],
             )
+        self._grid.part.fill(*components(p))
         clear(q)
         multigrid.product(p, q, launch=launch_recorded)
         operator.take_energy(self._difference, components(p), components(q))
@@ -249,6 +252,7 @@ class StokesSolve:
                 restart=VECTORS,
                 weight=weight,
                 at_once=self.operator.bodies is not None,
+                comm=self._grid.part.comm,
             )
             self._split_pressure = self._grid.field(wp.float64)
         return self._krylov
@@ -329,10 +333,10 @@ class StokesSolve:
         operator = self.operator
         operator.launch_set_up(kind, contact)
         for axis, (u, last) in enumerate(zip(velocity, self._last, strict=True)):
-            operator.window.run(
+            operator.faces.run(
                 operator.kernels.start_velocity, u=u, other=last, volume=operator.level.volume[axis]
             )
-        operator.window.run(
+        operator.cells.run(
             operator.kernels.start_pressure,
             x=self._projection.pressure,
             other=self._last_pressure,
@@ -340,6 +344,7 @@ class StokesSolve:
             other_kind=self._last_cells,
             ratio=self._ratio,
         )
+        self._grid.part.fill(*velocity, self._projection.pressure)
 
     def _splitting_error(self) -> float:
         """Return an estimate of |u - u2|_V, see `couple_from_last`."""
@@ -354,13 +359,15 @@ class StokesSolve:
         """Write x - x1, without velocities, to a vector."""
         operator, work = self.operator, self._preconditioner.work
         clear(work)
-        operator.window.run(
+        difference = operator.layout.pressure(work)
+        operator.cells.run(
             operator.kernels.pressure_difference,
-            out=operator.layout.pressure(work),
+            out=difference,
             x=self._projection.pressure,
             other=self._split_pressure,
             kind=self._projection.kind,
         )
+        self._grid.part.fill(difference)
 
     def _iterate(
         self,
@@ -411,7 +418,8 @@ class StokesSolve:
                 iterations += added
                 self._graphs["_launch_corrections"].run(velocity, krylov.x)
                 if operator.bodies is not None:
-                    operator.bodies.move(operator.layout.bodies(krylov.x))
+                    change = self._grid.part.ranks.share(operator.layout.bodies(krylov.x))
+                    operator.bodies.move(change)
                     moved()
                 switched = operator.find_free_cells(velocity, LOOK)
                 settled = not switched
@@ -442,15 +450,16 @@ class StokesSolve:
         """Add a correction to velocity and pressure."""
         operator, layout = self.operator, self.operator.layout
         for axis, (u, part) in enumerate(zip(velocity, layout.components(more), strict=True)):
-            operator.window.run(
+            operator.faces.run(
                 operator.kernels.add_velocity, u=u, more=part, volume=operator.level.volume[axis]
             )
-        operator.window.run(
+        operator.cells.run(
             operator.kernels.add_pressure,
             x=self._projection.pressure,
             more=layout.pressure(more),
             free=operator.free,
         )
+        self._grid.part.fill(*velocity, self._projection.pressure)
 
     def _save(self, velocity: Sequence[wp.array]) -> None:
         """Store the split step's result."""
@@ -470,9 +479,16 @@ class StokesSolve:
             moved()
 
     def state(self) -> dict[str, np.ndarray]:
-        """Return the state: where the next step begins."""
+        """Return the state: where the next step begins.
+
+        Pieces of a state have the cells of the domain alone. If a side of the domain is open,
+        velocities of the upper faces of the cells follow those of the lower ones.
+        """
+        velocity = [u.numpy() for u in self._last]
+        if self._has_open_sides:
+            velocity += [np.roll(u, -1, axis=2 - axis) for axis, u in enumerate(velocity)]
         return {
-            "coupled_velocity": np.stack([u.numpy() for u in self._last]),
+            "coupled_velocity": np.stack(velocity),
             "coupled_bodies": self._last_bodies.copy(),
             "coupled": np.array(
                 [self.continues, self._steps_to_estimate, self._share], dtype=float
@@ -481,7 +497,11 @@ class StokesSolve:
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Restore `state`, whose arrays have been checked."""
-        for u, values in zip(self._last, state["coupled_velocity"], strict=True):
+        velocity = np.array(state["coupled_velocity"])
+        lower, upper = np.split(velocity, [len(self._last)])
+        for axis, values in enumerate(upper):
+            np.moveaxis(lower[axis], 2 - axis, 0)[-1] = np.moveaxis(values, 2 - axis, 0)[-2]
+        for u, values in zip(self._last, lower, strict=True):
             u.assign(values)
         self._last_bodies = np.array(state["coupled_bodies"])
         continues, steps, self._share = (float(v) for v in state["coupled"])

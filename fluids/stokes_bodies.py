@@ -50,6 +50,7 @@ class StokesBodies:
         density: float,
     ) -> None:
         self.bodies, self._dimension, self._drag = bodies, grid.dimension, drag
+        self._part = grid.part
         self._scale = density * grid.cell_volume
         self.free_parts = grid.faces()
         self._flow = BodyCoupling(grid, boundary, bodies, density, open_parts=self.free_parts)
@@ -107,8 +108,14 @@ class StokesBodies:
         """Return C'u + U'x."""
         total = self._drag.columns.gather(u).numpy().copy()
         if x is not None:
-            total += self._flow.columns.gather(x).numpy()
+            total += self._flow.columns.gather(self._in_box(x)).numpy()
         return np.asarray(total)
+
+    def _in_box(self, field: wp.array) -> wp.array:
+        """Return a field of cells in the flat layout of the outflows U V."""
+        box = self._part.box_like(field)
+        self._part.copy_to_box(field, box)
+        return box.flatten()
 
     def rows(self, V: np.ndarray, u: wp.array, x: wp.array) -> np.ndarray:
         """Return V - m (C'u - D V + U'x)."""
@@ -120,9 +127,11 @@ class StokesBodies:
         self._drag.columns.scatter(self._factors, out, out, sign=-1.0)
 
     def add_outflow(self, V: np.ndarray, out: wp.array, free: wp.array, *, sign: float) -> None:
-        """Add sign U V to outflows of free cells."""
+        """Add sign U V to outflows of free cells, fields of the grid."""
         self._factors.assign(V)
-        self._flow.columns.scatter(self._factors, out, out, mask=free, sign=sign)
+        box, mask = self._in_box(out), self._in_box(free)
+        self._flow.columns.scatter(self._factors, box, box, mask=mask, sign=sign)
+        self._part.copy_from_box(box, out)
 
     def corrected(self, r: np.ndarray, z: wp.array) -> np.ndarray:
         """Return (1 + m D)^-1 (r + m C'z), the preconditioner's velocities."""

@@ -14,7 +14,7 @@ from warp_lcp.material.boundary import CutBoundary
 def viscous_impulses(
     operator: StokesOperator, velocity: Sequence[wp.array], points: np.ndarray, density: float
 ) -> np.ndarray:
-    """Return the viscous impulses on solids, with those of films.
+    """Return the viscous impulses on solids, with those of films, of this process's faces.
 
     Shape (1 + solids, 6), [N s] and [N m s].
 
@@ -44,8 +44,9 @@ def _film_impulses(
     The film on a face takes drag (u - u_wall) = share (D'x + M (u* - u_wall)).
     """
     grid, b = operator.grid, operator.boundary
-    low = grid.domain.low
-    cells = tuple(slice(*ends) for ends in zip(low, grid.domain.high, strict=True))
+    own = grid.part.owned
+    low = own.low
+    cells = tuple(slice(*ends) for ends in zip(low, own.high, strict=True))
     leaks, shares = operator.leak[axis].numpy(), operator.share[axis].numpy()
     at = np.argwhere(leaks[cells] > 0.0) + low
     below = at.copy()

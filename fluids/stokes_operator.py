@@ -64,10 +64,12 @@ KEEP, LOOK, FIRST = range(3)  # how free cells are found, see the kernel `diverg
 class StokesOperator:
     """Matrix and residual of the coupled solve, see the module.
 
-    `set_up` comes first in each step.
+    `set_up` comes first in each step. Its methods are collective. They write this process's own
+    faces and cells, and fill the ghost cells of what others read: velocities, pressures and
+    weights.
 
     Args:
-        grid: the grid, of one process.
+        grid: the grid.
         boundary: solids and walls.
         viscosity: the viscous solve, whose equations are used.
         projection: the pressure, whose cells and bounds are used.
@@ -169,6 +171,16 @@ class StokesOperator:
         return self._equations.window
 
     @property
+    def faces(self) -> Window:
+        """The cells of `window` whose lower faces this process sums up."""
+        return self.grid.part.faces(self.window)
+
+    @property
+    def cells(self) -> Window:
+        """The cells of `window` that this process sums up."""
+        return self.grid.part.own_cells(self.window)
+
+    @property
     def viscous_walls(self) -> ViscousWalls:
         """Walls of the links in `level`."""
         equations = self._equations
@@ -179,9 +191,9 @@ class StokesOperator:
         kernels, grid, b = self.kernels, self.grid, self.boundary
         thick = None if self.viscosity.mixed is None else self.viscosity.mixed.cells
         equations = self._equations
-        level, window = equations.level, equations.window
+        level = equations.level
         for axis in range(grid.dimension):
-            window.run(
+            self.faces.run(
                 kernels.masses,
                 volume=level.volume[axis],
                 leak=self.leak[axis],
@@ -199,7 +211,7 @@ class StokesOperator:
                 tau=equations.tau,
             )
         dx, dy, dz = three_components(equations.distance)
-        window.run(
+        self.cells.run(
             kernels.cells,
             cell=level.cell,
             mixed=level.mixed,
@@ -218,8 +230,9 @@ class StokesOperator:
         )
         copy(level.cell, self._cell)
         copy(level.mixed, self._mixed)
+        grid.part.fill(level.cell, level.mixed, self.contact, *level.volume)
         for (one, other), edge in level.edges.items():
-            window.run(
+            self.faces.run(
                 kernels.edges,
                 weight=edge,
                 da=equations.distance[one],
@@ -229,7 +242,12 @@ class StokesOperator:
                 a=one,
                 b=other,
             )
+        grid.part.fill(*level.edges.values())
         self.viscosity.set_diagonals(kind, self.contact)
+        fields = [self._products, self._across, *self.leak, *self.share]
+        fields += [] if self.bodies is None else self.bodies.free_parts
+        weights = [*level.drag, *level.hold, *level.diagonal]
+        grid.part.fill(*weights, *(field for field in fields if field is not None))
 
     # Matrix
 
@@ -239,16 +257,16 @@ class StokesOperator:
         if self.bodies is not None:
             V = self.layout.bodies(p)
             self.bodies.add_forces(V, q)
-            self.bodies.add_outflow(V, self.layout.flat_pressure(q), self.free.flatten(), sign=-1.0)
-            self.layout.set_bodies(q, self.bodies.rows(V, p, self.layout.flat_pressure(p)))
+            self.bodies.add_outflow(V, self.layout.pressure(q), self.free, sign=-1.0)
+            self.layout.set_body_rows(q, self.bodies.rows(V, p, self.layout.pressure(p)))
 
     def _launch_product(self, p: wp.array, q: wp.array) -> None:
         """Write q = K p without bodies."""
-        level, window = self.level, self.window
+        level = self.level
         self.viscosity.multigrid.product(p, q, launch=launch_recorded)
         u, force, x = self.layout.components(p), self.layout.components(q), self.layout.pressure(p)
         for axis in range(self.grid.dimension):
-            window.run(
+            self.faces.run(
                 self.kernels.gradient,
                 out=force[axis],
                 volume=level.volume[axis],
@@ -270,7 +288,7 @@ class StokesOperator:
         if self._across is None or self.projection.lower is None:
             return
         for axis, rows in enumerate(force):
-            self.window.run(
+            self.faces.run(
                 self.kernels.beside_walls,
                 out=rows,
                 volume=self.level.volume[axis],
@@ -290,7 +308,7 @@ class StokesOperator:
         ax, ay, az = three_components(self.boundary.open)
         vx, vy, vz = three_components(level.volume)
         leak_x, leak_y, leak_z = three_components(self.leak)
-        self.window.run(
+        self.cells.run(
             self.kernels.outflow,
             out=out,
             x=x,
@@ -332,13 +350,14 @@ class StokesOperator:
             # Signs of outflows below the residual mean nothing.
             switched = self._divergence(velocity, LOOK, NOISE * most, worst)[0]
         if projection.lower is not None and (switched or look == FIRST):
-            self.window.run(
+            self.cells.run(
                 self.kernels.bound,
                 x=projection.pressure,
                 lower=projection.lower,
                 kind=projection.kind,
                 free=self.free,
             )
+            self.grid.part.fill(projection.pressure)
         return int(switched)
 
     def residual(
@@ -364,14 +383,13 @@ class StokesOperator:
         if self.bodies is not None:
             for part, u in zip(self.layout.components(work), velocity, strict=True):
                 copy(part, u)
-            x = self.projection.pressure.flatten()
-            rows = self.bodies.rows(self.bodies.velocities, work, x)
-            self.layout.set_bodies(r, self.bodies.start - rows)
+            rows = self.bodies.rows(self.bodies.velocities, work, self.projection.pressure)
+            self.layout.set_body_rows(r, self.bodies.start - rows)
 
     def _launch_held(self, velocity: Sequence[wp.array]) -> None:
         """Update the velocity of faces in walls that are partly open."""
         for axis in range(self.grid.dimension):
-            self.window.run(
+            self.faces.run(
                 self.kernels.held,
                 u=velocity[axis],
                 before=self.start[axis],
@@ -383,6 +401,7 @@ class StokesOperator:
                 kind=self.projection.kind,
                 axis=axis,
             )
+        self.grid.part.fill(*velocity)
 
     def settle_bodies(self, velocity: Sequence[wp.array], work: wp.array) -> None:
         """Apply the impulses of the liquid to the bodies, after a solve.
@@ -394,15 +413,15 @@ class StokesOperator:
         if self.bodies is not None:
             for part, u in zip(self.layout.components(work), velocity, strict=True):
                 copy(part, u)
-            self.bodies.apply_impulses(work, self.projection.pressure.flatten())
+            self.bodies.apply_impulses(work, self.projection.pressure)
 
     def _launch_residual(self, velocity: Sequence[wp.array], residual: wp.array) -> None:
         """Write the residual from the viscous force and the outflow, without bodies."""
-        kernels, level, window = self.kernels, self.level, self.window
+        kernels, level = self.kernels, self.level
         copy(residual[self.layout.velocities], self.viscosity.multigrid.r)
         r = self.layout.components(residual)
         for axis in range(self.grid.dimension):
-            window.run(
+            self.faces.run(
                 kernels.force,
                 out=r[axis],
                 volume=level.volume[axis],
@@ -417,7 +436,7 @@ class StokesOperator:
                 sign=1.0,
             )
         self._add_products(velocity, r, -1.0)
-        window.run(
+        self.cells.run(
             kernels.right_side,
             out=self.layout.pressure(residual),
             r=self.outflows,
@@ -441,7 +460,7 @@ class StokesOperator:
         ax, ay, az = three_components(self.boundary.open)
         solid_x, solid_y, solid_z = three_components(self.boundary.velocity)
         self._divergences.launch(
-            self.window,
+            self.cells,
             y=self.outflows,
             u=ux,
             v=uy,
@@ -484,7 +503,7 @@ class StokesOperator:
     def _launch_differences(self, velocity: Sequence[wp.array]) -> None:
         """Write u - u* to the viscous solve's change."""
         for axis, change in enumerate(self.viscosity.change):
-            self.window.run(
+            self.faces.run(
                 self.kernels.difference,
                 out=change,
                 a=velocity[axis],
@@ -506,7 +525,7 @@ class StokesOperator:
         """Launch the sums of u'M u and u'force, of the kernel `energy`."""
         for axis in range(self.grid.dimension):
             sums.launch(
-                self.window,
+                self.faces,
                 axis,
                 u=u[axis],
                 force=force[axis],

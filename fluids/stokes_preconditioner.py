@@ -29,7 +29,7 @@ class StokesPreconditioner:
 
     Attributes:
         r, z, work: vectors.
-        weight: reciprocal diagonals, the weights of residuals.
+        weight: reciprocal diagonals, the weights of residuals; 0 in entries that other ranks own.
     """
 
     def __init__(self, operator: StokesOperator) -> None:
@@ -48,17 +48,20 @@ class StokesPreconditioner:
         )
         self._velocity_residual = self.r[self.layout.velocities]
         self._pressure = GridSystem(operator.projection.operator, wp.float32, bounded=False)
-        self._free_cells = operator.free.flatten()
+        # Without ghost cells; in one process they share memory with the fields of the grid.
+        self._right_side, self._cycle_x = (
+            grid.part.grid_field(box) for box in (self._pressure.r, self._pressure.z)
+        )
+        self._free_cells = grid.part.box_like(operator.free)
         self._square_of_bodies = 0.0
         self._squares = WindowSums(kernels.velocity_correction, grid, grid.dimension)
         self._pressure_square = WindowSums(kernels.correction, grid)
         self._graphs = launch_graphs(
-            grid.device,
-            self._launch_velocities,
-            self._launch_right_side,
-            self._launch_pressures,
-            self._launch_set_up,
+            grid.device, self._launch_velocities, self._launch_right_side, self._launch_pressures
         )
+        # The viscous multigrid of ranks is set up by the host.
+        set_up = launch_graphs(grid.device, self._launch_set_up, at_once=grid.part.shared)
+        self._graphs |= set_up
 
     def set_up(self, velocity: Sequence[wp.array]) -> None:
         """Set up the cycles, the correction c and the weights of the rows."""
@@ -67,16 +70,16 @@ class StokesPreconditioner:
         clear(self.weight, operator.free)
         if operator.bodies is not None:
             operator.bodies.update(operator.level, operator.viscous_walls, velocity)
-            self.layout.set_bodies(self.weight, operator.bodies.weights)
+            self.layout.set_body_rows(self.weight, operator.bodies.weights)
         self._graphs["_launch_set_up"].run()
 
     def _launch_set_up(self) -> None:
         """Launch the set-up of the viscous cycle, of c and of the weights."""
         operator, kind = self.operator, self.operator.projection.kind
-        level, window = operator.level, operator.window
+        level = operator.level
         operator.viscosity.multigrid.set_up()
         for axis, weight in enumerate(self.layout.components(self.weight)):
-            window.run(
+            operator.faces.run(
                 operator.kernels.weights,
                 weight=weight,
                 volume=level.volume[axis],
@@ -90,7 +93,7 @@ class StokesPreconditioner:
         diagonal_x, diagonal_y, diagonal_z = three_components(level.diagonal)
         leak_x, leak_y, leak_z = three_components(operator.leak)
         share_x, share_y, share_z = three_components(operator.share)
-        window.run(
+        operator.cells.run(
             operator.kernels.scale,
             coefficient=self._coefficient,
             weight=self.layout.pressure(self.weight),
@@ -116,18 +119,21 @@ class StokesPreconditioner:
 
     def restrict(self) -> None:
         """Restrict the pressure's cycle to the free cells."""
-        self._pressure.restrict(self._free_cells)
+        self.operator.grid.part.copy_to_box(self.operator.free, self._free_cells)
+        self._pressure.restrict(self._free_cells.flatten())
 
     def apply(self) -> None:
         """Write z = P r, see the class; GMRES calls it."""
         self._graphs["_launch_velocities"].run(self._viscous_cycle)
         if self.operator.bodies is not None:
-            r_bodies = self.layout.bodies(self.r)
+            r_bodies = self.layout.body_rows(self.r)
             z_bodies = self.operator.bodies.corrected(r_bodies, self.z)
             self._square_of_bodies = self.operator.bodies.square(z_bodies, r_bodies)
             self.layout.set_bodies(self.z, z_bodies)
             self._graphs["_launch_right_side"].run()
-            self.operator.bodies.add_outflow(z_bodies, self._pressure.r, self._free_cells, sign=1.0)
+            self.operator.bodies.add_outflow(
+                z_bodies, self._right_side, self.operator.free, sign=1.0
+            )
         self._graphs["_launch_pressures"].run(self._pressure.program)
 
     def viscous_norm(self) -> float:
@@ -140,7 +146,7 @@ class StokesPreconditioner:
         square = self._squares.read()[0] - self.operator.kinetic_energy(u)
         bodies = self.operator.bodies
         if bodies is not None:
-            r_bodies = self.layout.bodies(self.r)
+            r_bodies = self.layout.body_rows(self.r)
             z_bodies = bodies.corrected(r_bodies, self.z)
             square += bodies.square(z_bodies, r_bodies - z_bodies)
         return math.sqrt(max(square, 0.0))
@@ -161,7 +167,7 @@ class StokesPreconditioner:
         found, r, z = (self.layout.components(v) for v in (multigrid.z, self.r, self.z))
         for axis in range(self.operator.grid.dimension):
             self._squares.launch(
-                operator.window,
+                operator.faces,
                 axis,
                 z=z[axis],
                 cycle=found[axis],
@@ -172,17 +178,16 @@ class StokesPreconditioner:
                 kind=self.operator.projection.kind,
                 axis=axis,
             )
+        operator.grid.part.fill(*z, width=1)
 
     def _launch_right_side(self) -> None:
         """Write the right-hand side of the pressure's cycle, r_x + D z_u without bodies."""
-        x, work = self.layout.flat_pressure(self.z), self.layout.pressure(self.work)
+        x, work = self.layout.pressure(self.z), self.layout.pressure(self.work)
         clear(x)
-        self.operator.minus_outflow(
-            self.layout.components(self.z), x.reshape(self.operator.grid.shape), work
-        )
-        self.operator.window.run(
+        self.operator.minus_outflow(self.layout.components(self.z), x, work)
+        self.operator.cells.run(
             self.operator.kernels.right_side,
-            out=self._pressure.r.reshape(self.operator.grid.shape),
+            out=self._right_side,
             r=self.layout.pressure(self.r),
             q=work,
             free=self.operator.free,
@@ -191,15 +196,18 @@ class StokesPreconditioner:
 
     def _launch_pressures(self, cycle: CommandBuffer) -> None:
         """Write the pressures of z: a cycle plus c; without bodies the right-hand side, too."""
+        part, z = self.operator.grid.part, self.layout.pressure(self.z)
         if self.operator.bodies is None:
             self._launch_right_side()
+        part.copy_to_box(self._right_side, self._pressure.r)
         cycle.run()
-        system, shape = self._pressure, self.operator.grid.shape
+        part.copy_from_box(self._pressure.z, self._cycle_x)
         self._pressure_square.launch(
-            self.operator.window,
-            z=self.layout.pressure(self.z),
-            cycle=system.z.reshape(shape),
-            r=system.r.reshape(shape),
+            self.operator.cells,
+            z=z,
+            cycle=self._cycle_x,
+            r=self._right_side,
             coefficient=self._coefficient,
             free=self.operator.free,
         )
+        part.fill(z, width=1)

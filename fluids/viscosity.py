@@ -492,11 +492,12 @@ class Viscosity:
             sums.changed()
 
     def read_force(self) -> tuple[float, float]:
-        """Return energies after `launch_force`, in units of the mass of a cell.
+        """Return energies after `launch_force`, in units of the mass of a cell; collective.
 
         The energy dissipated, and the work of walls.
         """
-        _, lost, driven, _ = np.sum([sums.read() for sums in self._sums], axis=0)
+        own = np.sum([sums.read() for sums in self._sums], axis=0)
+        _, lost, driven, _ = self.grid.part.ranks.sum(own)
         return float(lost + driven), float(driven)
 
     @property

@@ -12,7 +12,7 @@ from warp_lcp.grid.grid_part import subdomain_of
 from warp_lcp.grid.staggered import ActiveWindow, StaggeredGrid, Window
 from warp_lcp.kernels.fields import zeros
 from warp_lcp.kernels.launch_graph import CommandBuffer, Launch, launch_now, perform
-from warp_lcp.multigrid.cycle import Cycle, GatheredLevel, Launches, recorded
+from warp_lcp.multigrid.cycle import CoarsestSolver, Cycle, GatheredLevel, Launches, recorded
 from warp_lcp.multigrid.halo_levels import GATHERED
 
 LEAST = 8  # cells of the longest side of the coarsest level
@@ -54,8 +54,12 @@ class ViscosityMultigrid:
         # Those of them in the domain.
         self._inner = [ActiveWindow(level.grid.domain) for level in self.levels]
         self._window: Window | None = None  # window of the last `move_to`
+        self.program = self._recorded(self.cycle)
+
+    def _recorded(self, cycle: Cycle) -> CommandBuffer:
+        """Return the launches of a cycle on r."""
         begin = [Launches(partial(perform, self._take_right_side))] if self._shared else []
-        self.program = recorded(grid.device, [*begin, *self.cycle.stages()])
+        return recorded(self.grid.device, [*begin, *cycle.stages()])
 
     def _take_right_side(self) -> None:
         wp.copy(self._b, self.r)
@@ -90,30 +94,32 @@ class ViscosityMultigrid:
     def light_program(self) -> CommandBuffer:
         """Return the launches of a cycle with fewer sweeps beside walls and surfaces.
 
-        Coupled solves need about as many iterations with it as with `program`. One process only.
+        Coupled solves need about as many iterations with it as with `program`.
         """
-        light = [LightLevel(level) for level in self.levels]
-        return recorded(self.grid.device, Cycle(light, self.levels[-1].solve).stages())
+        return self._recorded(self._light_cycle)
 
     @property
     def cycle(self) -> Cycle:
         """One cycle on the levels; on ranks, the last one gathered."""
+        whole = None if self._gathered is None else self._gathered.cycle
+        return Cycle(self.levels, self._coarsest(whole))
+
+    @property
+    def _light_cycle(self) -> Cycle:
+        whole = None if self._gathered is None else self._gathered._light_cycle
+        return Cycle([LightLevel(level) for level in self.levels], self._coarsest(whole))
+
+    def _coarsest(self, whole: Cycle | None) -> CoarsestSolver:
+        """Return the solver of the last level; a cycle on the `whole` grid where it is gathered."""
         last = self.levels[-1]
-        if self._gathered is None:
-            return Cycle(self.levels, last.solve)
-        part = subdomain_of(last.grid)
-        whole, first = self._gathered.cycle, self._gathered.levels[0]
+        if whole is None or self._gathered is None:
+            return last.solve
+        part, first = subdomain_of(last.grid), self._gathered.levels[0]
         gather = Launches(partial(perform, partial(part.collect, last.b, first.b)))
         copy_part = Launches(partial(perform, partial(_copy_part, last, first)))
-        return Cycle(
-            self.levels,
-            GatheredLevel(
-                whole=lambda projected: whole,
-                gather=[gather],
-                gather_bounds=[],
-                copy_part=copy_part,
-            ).solve,
-        )
+        return GatheredLevel(
+            whole=lambda projected: whole, gather=[gather], gather_bounds=[], copy_part=copy_part
+        ).solve
 
     def components(self, field: wp.array) -> list[wp.array]:
         """Return views of a flat field, one per component."""

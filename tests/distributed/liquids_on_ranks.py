@@ -4,7 +4,6 @@
 """
 
 import json
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -140,6 +139,8 @@ PLUNGER = box(
     motion={"kind": "translation", "velocity": [0.3, 0.2, 0.0]},
 )
 THICK = {"viscosity": {"value": 20.0}, "wall": "sticky", "solid": [BALL]}
+# Velocity and pressure are solved at once in every step.
+COUPLED = {"viscosity": {"value": 50.0}, "solid": [DISC], "solver": {"precision": "double"}}
 
 
 def walled(low, high, *, lid=False, **more):
@@ -247,6 +248,10 @@ SCENES = {
         "density_correction": {},
         "solver": {"precision": "double", "method": "minimum-map-newton"},
     },
+    "coupled": FLAT | COUPLED | {"output": {"forces": True}},
+    "coupled, open": FLAT
+    | COUPLED
+    | {"domain": OPEN | {"wall": "sticky"}, "liquid": [box([0.2, 0.0], [1.0, 0.3])]},
     "thick floating": DEEP | FLOATING | {"viscosity": {"value": 5.0}, "resolution": 24},
     "unilateral rafts": FLAT
     | {"solid": RAFTS, "pressure": {"model": "unilateral"}, "solver": {"precision": "double"}},
@@ -292,7 +297,7 @@ LATE = box([0.7, 0.3], [0.8, 0.4], velocity=[0.5, 0.0], start=0.02)
 BARE = {  # every stage of a step, with an empty rank
     "viscous": CORNER
     | {
-        "viscosity": {"value": 5.0},
+        "viscosity": {"value": 50.0},
         "wall": "sticky",
         "solid": [AWAY],
         "output": SHOWN | {"forces": True},
@@ -355,12 +360,7 @@ BARE_STEPS = 4
 
 
 def scene(**tables) -> ParticleScene:
-    """Return a scene of liquid, or of sand.
-
-    Ranks solve for pressure and viscosity one after the other, so the scene on one process does so.
-    """
-    if "viscosity" in tables:
-        tables["viscosity"] = tables["viscosity"] | {"splitting_tolerance": math.inf}
+    """Return a scene of liquid, or of sand."""
     return small_sands.scene(**tables) if "sand" in tables else small_liquids.scene(**tables)
 
 
@@ -515,6 +515,7 @@ RESUMED = (
     "crowded",
     "floating",
     "thick and thin",
+    "coupled",
     "banded",
     "sand",
     "stirred sand",

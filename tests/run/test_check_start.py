@@ -330,16 +330,3 @@ def test_thin_meshes_of_whole_cells_are_said_to_let_their_own_material_pass(tmp_
                 )
                 == passes
             )
-
-
-def test_check_under_mpiexec_says_what_ranks_leave_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path = str(written(tmp_path / "honey.toml", [LIQUID], viscosity={"value": 10.0}))
-    note = "viscosity.splitting_tolerance has no effect on several ranks"
-    for ranks in 1, 2:
-        monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", str(ranks))
-        result = invoke("check", path)
-        assert (note in " ".join(result.output.split())) == (ranks == 2)
-    finite = "viscosity.splitting_tolerance=inf"
-    assert note not in " ".join(invoke("check", path, "--set", finite).output.split())

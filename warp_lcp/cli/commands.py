@@ -325,7 +325,6 @@ def check(
     overrides: SetOption = None,
 ) -> None:
     """Validate a scene; estimate memory and run time; list suspicious settings."""
-    from warp_lcp.distributed.launch import processes_started
     from warp_lcp.material.particle_scene import ParticleScene
     from warp_lcp.run.check import check_memory, check_scene, start
     from warp_lcp.run.estimate import doubts, estimate_run
@@ -343,9 +342,9 @@ def check(
         if not force_memory:
             check_memory(loaded, chosen_device)
             beginning = start(loaded, chosen_device)
-            ranks = loaded.rank_notes() if processes_started() > 1 else []
-            notes = (*ranks, *beginning.notes(), *doubts(loaded, beginning))
-            _print_pairs([("note", note) for note in notes])
+            _print_pairs(
+                [("note", note) for note in (*beginning.notes(), *doubts(loaded, beginning))]
+            )
             if not calibrate:
                 _print_pairs(estimate_run(loaded, beginning))
         if not calibrate:

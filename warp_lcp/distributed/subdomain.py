@@ -227,6 +227,10 @@ class Subdomain(GridPart):
         """Return the cells whose lower faces belong to the box."""
         return self.own_faces
 
+    def own_cells(self, window: Window) -> Window:
+        """Return the cells of the box."""
+        return self._owned
+
     def whole(self, window: Window) -> Window:
         """Return all cells: other ranks may have material where this rank has none."""
         return self.grid.everywhere
@@ -562,11 +566,24 @@ class Subdomain(GridPart):
             else wp.zeros(view.shape, dtype=field.dtype, device=self.grid.device)
         )
 
+    def grid_field(self, box: wp.array) -> wp.array:
+        """Return a field of zeros for the values of a field of the box."""
+        return self.grid.field(box.dtype)
+
     def copy_to_box(self, field: wp.array, box: wp.array) -> None:
         """Copy the part's values to a field of the box, unless they share memory."""
         view = self.stored_box_of(field)
         if view.ptr != box.ptr:
-            copy_cells(box, view)
+            copy_cells(self._in_box(box), view)
+
+    def copy_from_box(self, box: wp.array, field: wp.array) -> None:
+        """Copy the cells of a field of the box to the part, without ghost cells."""
+        copy_cells(self.box_of(field), self._in_box(box)[1:-1, 1:-1, 1:-1])
+
+    def _in_box(self, box: wp.array) -> wp.array:
+        """Return a field of the box, perhaps flat, in the box's stored shape."""
+        nx, ny, nz = self.box.counts
+        return box.reshape((nz + 2, ny + 2, nx + 2))
 
     def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
         """Write the solution of a problem on the box to the part; collective.
@@ -576,8 +593,7 @@ class Subdomain(GridPart):
         if x.dtype is not wp.float64:  # result of a method in single precision
             convert(x.flatten(), spare.flatten())
             x = spare
-        nx, ny, nz = self.box.counts
-        copy_cells(self.box_of(field), x.reshape((nz + 2, ny + 2, nx + 2))[1:-1, 1:-1, 1:-1])
+        self.copy_from_box(x, field)
         self.fill(field)
 
     @property

@@ -401,6 +401,13 @@ class GridPart:
         """
         return window
 
+    def own_cells(self, window: Window) -> Window:
+        """Return the cells of a window that this process sums up.
+
+        The window is one around its material.
+        """
+        return window
+
     def whole(self, window: Window) -> Window:
         """Return the cells that all processes visit together, from one process's window.
 
@@ -464,8 +471,24 @@ class GridPart:
         """
         return field
 
+    def grid_field(self, box: wp.array) -> wp.array:
+        """Return the field that stands for an array like those of `box_like` on the grid.
+
+        It shares the array's memory if the part has no ghost cells.
+
+        Args:
+            box: flat, or in the shape of `box_like`.
+        """
+        return box.reshape(self.grid.shape)
+
     def copy_to_box(self, field: wp.array, box: wp.array) -> None:
         """Copy a field to the array of `box_like`, unless they share their memory."""
+
+    def copy_from_box(self, box: wp.array, field: wp.array) -> None:
+        """Copy the owned cells of an array like those of `box_like` to a field.
+
+        Nothing is done if they share their memory.
+        """
 
     def store(self, x: wp.array, field: wp.array, spare: wp.array) -> None:
         """Write the solution on the owned cells to a field, with ghost cells; collective.

@@ -15,7 +15,7 @@ from warp_lcp.kernels.launch_graph import LaunchGraph, clear
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.kernels.recorded_arguments import Scalar
 from warp_lcp.kernels.types import DeviceArray
-from warp_lcp.kernels.vectors import RowReduction, rows_of
+from warp_lcp.kernels.vectors import Communicator, RowReduction, rows_of
 from warp_lcp.krylov.conjugate_gradient import KrylovPreconditioner, LinearMap
 from warp_lcp.krylov.hessenberg import HessenbergLeastSquares
 
@@ -49,8 +49,10 @@ class FlexibleGMRES:
         product: A.
         preconditioner: M, an approximation of A's inverse.
         restart: the most vectors.
-        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0.
+        weight: residuals are measured as ||weight^(1/2) r||, field like r >= 0. It is 0 in entries
+            that do not count, such as those that other processes count.
         at_once: whether A or M have tasks of the host, and are launched in each run.
+        comm: communicator of the other parts of the fields; None if serial.
 
     Attributes:
         x: the change of the solution by the last `extend`.
@@ -66,6 +68,7 @@ class FlexibleGMRES:
         restart: int,
         weight: DeviceArray,
         at_once: bool = False,
+        comm: Communicator | None = None,
     ) -> None:
         r, size = preconditioner.r, preconditioner.r.size
         self._product, self._preconditioner, self._restart = product, preconditioner, restart
@@ -73,7 +76,7 @@ class FlexibleGMRES:
         self._basis = zeros((restart + 1) * size, r.dtype, r.device)  # fields, one after another
         self._images = zeros(restart * size, r.dtype, r.device)  # the same, preconditioned
         # Products with them, and a square in the last slot.
-        self._sums = RowReduction(rows_of(r), restart + 1, slots=restart + 2)
+        self._sums = RowReduction(rows_of(r), restart + 1, slots=restart + 2, comm=comm)
         # Columns of H, one row each, with the square of the norm at the end.
         self._read = DeviceScalar(r.device, restart * (restart + 2))
         self._factors = wp.zeros(restart + 1, dtype=wp.float64, device=r.device)

@@ -548,13 +548,6 @@ class Scene(Table):
                 )
         return [*notes, *scene_notes(self)]
 
-    def rank_notes(self) -> list[str]:
-        """Return notes on settings without effect on several ranks.
-
-        Subclasses add those of their tables.
-        """
-        return []
-
     def memory_parts(self) -> dict[str, int]:
         """Return the estimated memory of each part of a run on its device [bytes].
 
