@@ -530,8 +530,7 @@ class LiquidSimulation(ParticleSimulation):
             self.stokes.keep_start(self.velocity, self.kick_dt)
         if self.forces is not None:
             self._impulses_before = self.forces.impulses.copy()
-        bodies = [] if self.bodies is None else self.bodies.bodies
-        self._momenta_before = [body.momenta() for body in bodies]
+        self._momenta_before = np.empty(0) if self.bodies is None else self.bodies.bodies.momenta()
 
     def _apply_viscosity(
         self, viscosity: Viscosity, window: Window, dt: float, speed: float
@@ -585,10 +584,8 @@ class LiquidSimulation(ParticleSimulation):
         if self.stokes is not None:
             self.stokes.keep_viscous(self.velocity)
         viscosity.undo(self.velocity)
-        for body, values in zip(
-            self.bodies.bodies if self.bodies is not None else (), momenta, strict=True
-        ):
-            body.restore_momenta(values)
+        if self.bodies is not None:
+            self.bodies.bodies.restore_momenta(momenta)
         viscosity.push_bodies()
         return dict(zip(VISCOUS_COLUMNS, total.row(), strict=True))
 
@@ -634,24 +631,18 @@ class LiquidSimulation(ParticleSimulation):
                 self._held(projected)
         return projected, Row(result.row())
 
-    def _move_on(
-        self, viscosity: Viscosity, momenta: Sequence[tuple[np.ndarray, ...]], dt: float
-    ) -> list[tuple[np.ndarray, ...]]:
+    def _move_on(self, viscosity: Viscosity, momenta: np.ndarray, dt: float) -> np.ndarray:
         """Apply the impulses of one of several viscous solves of a step to the bodies.
 
         Returns their momenta before the first solve with these impulses added.
         """
         if self.bodies is None:
-            return []
-        bodies = self.bodies.bodies
-        before = [body.momenta() for body in bodies]
+            return momenta
+        before = self.bodies.bodies.momenta()
         viscosity.push_bodies()
         # The velocities of the bodies have changed.
         self.boundary.begin_step(self.time, dt)
-        changes = zip(momenta, before, (body.momenta() for body in bodies), strict=True)
-        return [
-            tuple(kept + now - then for kept, then, now in zip(*of, strict=True)) for of in changes
-        ]
+        return momenta + self.bodies.bodies.momenta() - before
 
     def _project(
         self, window: Window, dt: float, speed: float, *, measured: bool = True

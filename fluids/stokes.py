@@ -466,7 +466,7 @@ class StokesSolve:
         self.keep_viscous(velocity)
         copy(self._split_pressure, self._projection.pressure)
         if self.operator.bodies is not None:
-            self._split_momenta = self.operator.bodies.momenta()
+            self._split_momenta = self.operator.bodies.states.momenta()
 
     def _restore(self, velocity: Sequence[wp.array], moved: Callable[[], None]) -> None:
         """Restore the split step's result."""
@@ -475,7 +475,7 @@ class StokesSolve:
         copy(self._projection.pressure, self._split_pressure)
         bodies = self.operator.bodies
         if bodies is not None:
-            bodies.restore_momenta(self._split_momenta)
+            bodies.states.restore_momenta(self._split_momenta)
             moved()
 
     def state(self) -> dict[str, np.ndarray]:

@@ -14,6 +14,7 @@ from warp_lcp.fluids.viscosity_level import ViscosityLevel
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.material.boundary import CutBoundary
 from warp_lcp.rigid.bodies import RigidBodies
+from warp_lcp.rigid.body import BodyStates
 
 
 class StokesBodies:
@@ -62,21 +63,17 @@ class StokesBodies:
     @property
     def velocities(self) -> np.ndarray:
         """V of all bodies [m/s, 1/s], shape (rank,)."""
-        return np.ravel([body.velocities(self._dimension) for body in self.bodies.bodies])
+        return np.ravel([body.velocities(self._dimension) for body in self.states])
+
+    @property
+    def states(self) -> BodyStates:
+        """States of the bodies."""
+        return self.bodies.bodies
 
     def keep_start(self) -> None:
         """Store V*, and the momenta."""
         self.start = self.velocities
-        self._start_momenta = self.momenta()
-
-    def momenta(self) -> list[tuple[np.ndarray, ...]]:
-        """Return the momenta and the impulses received, for `restore_momenta`."""
-        return [body.momenta() for body in self.bodies.bodies]
-
-    def restore_momenta(self, momenta: Sequence[tuple[np.ndarray, ...]]) -> None:
-        """Restore momenta and received impulses."""
-        for body, values in zip(self.bodies.bodies, momenta, strict=True):
-            body.restore_momenta(values)
+        self._start_momenta = self.states.momenta()
 
     def update(
         self, level: ViscosityLevel, walls: ViscousWalls, velocity: Sequence[wp.array]
@@ -89,7 +86,7 @@ class StokesBodies:
         # Masses without supports: m itself is singular along supported directions, and a
         # pseudo-inverse of it amplifies rounding. For z and r in the range of m,
         # z'm^+ r = z'm0^-1 r with m0 = rho dx^d times the inverse of these masses.
-        inverses = [body.free_inverse_mass(self._dimension) for body in self.bodies.bodies]
+        inverses = [body.free_inverse_mass(self._dimension) for body in self.states]
         self._masses = scipy.linalg.block_diag(*(np.linalg.inv(m) for m in inverses))
         self._response = np.linalg.inv(np.eye(self.rank) + self._m @ self._D)
         self._energy = self._masses / self._scale
@@ -157,12 +154,12 @@ class StokesBodies:
         change by the residual of the bodies' rows.
         """
         impulse = self._pulled(u, x) - self._D @ self.velocities
-        self.restore_momenta(self._start_momenta)
+        self.states.restore_momenta(self._start_momenta)
         self._push(self._scale * impulse)
 
     def _push(self, impulses: np.ndarray) -> None:
         """Apply impulses, shape (rank,)."""
-        self.bodies.bodies.apply_impulses(impulses.reshape(len(self.bodies.bodies), -1))
+        self.states.apply_impulses(impulses.reshape(len(self.states), -1))
 
     def settle(self) -> None:
         """End the step: the bodies have its velocities."""

@@ -235,14 +235,6 @@ class RigidBody:
         self.values[:STATE] = state
         self.release()
 
-    def momenta(self) -> tuple[np.ndarray, ...]:
-        """Return the momenta, for `restore_momenta`."""
-        return self.momentum, self.angular_momentum, self.received_impulse
-
-    def restore_momenta(self, kept: tuple[np.ndarray, ...]) -> None:
-        """Restore the momenta: undo all impulses since `momenta`."""
-        self.momentum, self.angular_momentum, self.received_impulse = kept
-
     def release(self) -> None:
         """Remove the supports of the body, and reset the impulses received."""
         self.hold, self.received_impulse = None, np.zeros(6)
@@ -310,6 +302,15 @@ class BodyStates(Sequence[RigidBody]):
         """Return linear and angular velocities [m/s, rad/s], shape (n, 6)."""
         spin = spins(self.rotation, self.inverse_inertia, self.angular_momentum)
         return np.concatenate([self.momentum / self.mass[:, None], spin], axis=1)
+
+    def momenta(self) -> np.ndarray:
+        """Return momenta, angular momenta and impulses received, shape (n, 12), a copy."""
+        return np.concatenate([self.momentum, self.angular_momentum, self.received_impulse], axis=1)
+
+    def restore_momenta(self, momenta: np.ndarray) -> None:
+        """Restore `momenta`: undo all impulses since then."""
+        self.momentum[:], self.angular_momentum[:] = momenta[:, :3], momenta[:, 3:6]
+        self.received_impulse[:] = momenta[:, 6:]
 
     def inverse_masses(self, dimension: int) -> np.ndarray:
         """Return `RigidBody.inverse_mass` of all, shape (n, k, k).
