@@ -204,6 +204,7 @@ class Viscosity:
             bool(boundary.velocity),
             thickest is not None,
             thin=grid.barriers is not None,
+            bodies=bodies is not None,
         )
         self._thickest = thickest or 1.0
         slips = np.asarray(slip_lengths, dtype=np.float32) / np.float32(grid.spacing)
@@ -561,7 +562,7 @@ class Viscosity:
         walls: list[wp.array | None] = [None] * 3
         nodes = index = None
         if isinstance(boundary, CutBoundary):
-            nodes, walls = boundary.cut.distance, [*boundary.cut.wall]
+            nodes, walls = boundary.cut.distance, [*boundary.cut.wall, None][:3]
         elif isinstance(boundary, WholeCells):
             index = boundary.solids.index
         near = self._box if self._placed else self.grid.everywhere
@@ -584,6 +585,7 @@ class Viscosity:
                 near.launch(thin.crossed_kernel, [number, self._slips, distance[axis], slip[axis]])
         (vx, vy, vz), (dx, dy, dz) = three_components(fine.volume), three_components(distance)
         (hx, hy, hz), mixed = three_components(slip), self.mixed
+        body_numbers = None if self._bodies is None else self._bodies.owners
         thick_edges = {} if mixed is None else mixed.edges
         self._above.run(
             passes.weights,
@@ -607,7 +609,12 @@ class Viscosity:
             thick_xz=thick_edges.get((0, 2)),
             thick_yz=thick_edges.get((1, 2)),
             kind=kind,
+            base=boundary.base,
             contact=contact,
+            wall_x=walls[0],
+            wall_y=walls[1],
+            wall_z=walls[2],
+            body=body_numbers,
             planes=planes,
             scale=self._tau,
         )

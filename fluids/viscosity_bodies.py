@@ -61,6 +61,7 @@ class ViscousWallCoupling:
     Attributes:
         rows: face of each c, in the flat field of all components.
         blocks: solid of each c.
+        owners: place in `numbers` of each solid, or -1, int32.
         values: c, shape (n, 3) or (n, 6).
     """
 
@@ -76,7 +77,7 @@ class ViscousWallCoupling:
         self.width, self.count = 3 if grid.dimension == 2 else 6, len(numbers)
         owners = np.full(solids, -1, dtype=np.int32)
         owners[list(numbers)] = np.arange(len(numbers))
-        self._owners = wp.array(owners, dtype=wp.int32, device=grid.device)
+        self.owners = wp.array(owners, dtype=wp.int32, device=grid.device)
         self._counts = wp.zeros(grid.shape[0] * grid.shape[1], dtype=wp.int32, device=grid.device)
 
     def update(
@@ -118,7 +119,7 @@ class ViscousWallCoupling:
                 whole=True,
                 kind=walls.kind,
                 contact=walls.contact,
-                body=self._owners,
+                body=self.owners,
                 base=self.boundary.base,
                 center=center,
                 index=index,
@@ -279,6 +280,11 @@ class BodyDrag:
         W = scipy.linalg.block_diag(*answers)
         self._weights = 0.5 * (W + W.T)
         self._response.assign(self._weights)
+
+    @property
+    def owners(self) -> wp.array:
+        """Number of the body of each solid, -1 for the others, int32."""
+        return self._pull.owners
 
     def factors(self) -> tuple[np.ndarray, np.ndarray]:
         """Return m and D of all bodies, block diagonal, see the class."""

@@ -55,6 +55,7 @@ def viscous_passes(
     moving: bool = False,
     varies: bool = False,
     thin: bool = False,
+    bodies: bool = False,
 ) -> ViscousKernels:
     """Return the kernels of the viscous solve for a dimension.
 
@@ -67,6 +68,7 @@ def viscous_passes(
         moving: whether solids have velocities.
         varies: whether viscosities differ.
         thin: whether there are solids thinner than cells.
+        bodies: whether there are rigid bodies.
     """
     area, deep = f"fluids.viscosity_{dimension}d", dimension == 3
     walls, flags = (
@@ -87,7 +89,9 @@ def viscous_passes(
 
     return ViscousKernels(
         distance=near("distance"),
-        weights=near("weights", "_varies" * varies, VARIES=varies),
+        weights=near(
+            "weights", "_varies" * varies + "_bodies" * bodies, VARIES=varies, BODIES=bodies
+        ),
         diagonal=near("diagonal", "_thin" * thin, THIN=thin),
         force=near("force", "_thin" * thin, THIN=thin),
         links=near("links"),

@@ -363,7 +363,7 @@ def modules_of_every_kernel(reals):
         pressure_passes(*variant)
     for dimension, *walls in itertools.product((2, 3), *((False, True),) * 4):
         viscous_passes(dimension, *walls)
-        viscous_passes(dimension, True, *walls[1:], thin=True)
+        viscous_passes(dimension, True, *walls[1:], thin=True, bodies=True)
     for cut, moving, ghost, varies, bounded in itertools.product((False, True), repeat=5):
         stokes_kernels(cut=cut, moving=moving, ghost=ghost, varies=varies, bounded=bounded)
     for axis in (0, 1, 2, CENTERS):

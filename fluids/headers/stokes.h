@@ -22,7 +22,8 @@ const int edge =
 // faces in a wall that are partly open. A film as thick as half of the open part holds these:
 // drag = tau nu_rel / (a / 2 + slip length). `leak` = a^2 / (m + drag) is their outflow per
 // difference of pressures, `share` = drag / (m + drag) the wall's part of their velocity;
-// `free_part` = a (1 - share).
+// `free_part` = a (1 - share). Where the film slips, it is stretched against the liquid beside it,
+// with the stress 2 tau nu_rel a per velocity: its leak has at least this resistance.
 //   compute    float32
 //   box        float32 volume, leak, share, free_part?, d, h, open?, phi?, thick?; int8 kind;
 //              uint8 contact
@@ -57,8 +58,10 @@ for (int i = edge; i < last; ++i) {
     if (wall && part > 0.0f && held && h[i] < INFINITY) {
         drag = tau * viscosity(i) / (0.5f * part + h[i]);
     }
+    const float stretch = wall && part > 0.0f ? 2.0f * tau * viscosity(i) * part : 0.0f,
+                resistance = drag > stretch ? drag : stretch;
     volume[i] = wall ? 0.0f : mass;
-    leak[i] = wall && part > 0.0f ? part * part / (mass + drag) : 0.0f;
+    leak[i] = wall && part > 0.0f ? part * part / (mass + resistance) : 0.0f;
     share[i] = wall && part > 0.0f ? drag / (mass + drag) : 0.0f;
     if (free_part) free_part[i] = fraction(i) * (1.0f - share[i]);
 }
@@ -167,7 +170,13 @@ for (int i = first; i < last; ++i) {
             by_force = force > 0.0f ? a * a / force : 0.0f;
         } else if (leak[axis][f] > 0.0f) {
             by_mass = leak[axis][f];
-            by_force = share[axis][f] > 0.0f ? leak[axis][f] / share[axis][f] : 0.0f;
+            by_force = share[axis][f] > 0.0f ? leak[axis][f] / share[axis][f] : INFINITY;
+            // the film's own stress, where it resists more than the wall
+            const float a = CUT ? open[axis][CUT ? f : 0] : 1.0f,
+                        resistance = a * a / leak[axis][f] - a;
+            if (resistance > 0.0f && a * a / resistance < 0.99f * by_force)
+                by_force = a * a / resistance;
+            by_force = by_force < INFINITY ? by_force : 0.0f;
         }
         inert += by_mass;
         stiff += by_force;

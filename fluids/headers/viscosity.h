@@ -86,12 +86,16 @@ for (int i = first; i < last; ++i) {
 }
 
 // kernel fluids.viscosity.weights: Share of cells, edges and faces that the liquid fills, times
-// `scale` for cells and edges; see fluids.viscosity
+// `scale` for cells and edges; see fluids.viscosity. An edge between a body (BODIES) and another
+// solid has no stress: a product of their two velocities would stand in no row of the liquid.
 //   compute    float32
+//   whole      int32 body?
 //   box        float32 cell, mixed, xy, xz?, yz?, vx, vy, vz?, dx, dy, dz?, hx, hy, hz?, phi?,
-//              thick?, thick_xy?, thick_xz?, thick_yz?; int8 kind; uint8 contact
+//              thick?, thick_xy?, thick_xz?, thick_yz?; int8 kind, base; uint8 contact; int16
+//              wall_x?, wall_y?, wall_z?
 //   numbers    int planes; float32 scale
-//   constants  AIR, FLUID, SOLID, RELEASED, CLOSE, ALIKE, GHOST, VARIES
+//   constants  AIR, FLUID, SOLID, RELEASED, CLOSE, ALIKE, GHOST, VARIES, BODIES
+#include "of_source"
 const int nx = given.cell.shape[2] - 2, ny = given.cell.shape[1] - 2, nz = given.cell.shape[0] - 2;
 const bool deep = planes == 2;
 const float* d[3] = {dx, dy, deep ? dz : dx};
@@ -118,6 +122,25 @@ const float* on_edges[3] = {VARIES ? thick_xy : dx, VARIES && deep ? thick_xz : 
 const auto viscosity = [&](const float* of, long long at) {
     return VARIES && of[VARIES ? at : 0] > 0.0f ? of[VARIES ? at : 0] : 1.0f;
 };
+const short* wall[3] = {wall_x, wall_y, deep ? wall_z : wall_x};
+const auto apart = [&](long long i, int a, int b) {  // whether edge i is between a body and a solid
+    if (!BODIES) return false;
+    const long long faces[4] = {i, i - step[b], i, i - step[a]};  // two of a, two of b
+    int first_owner = -1;
+    bool several = false, bodies = false;
+    for (int f = 0; f < 4; ++f) {
+        const int axis = f < 2 ? a : b;
+        const long long q = faces[f];
+        if (!(d[axis][q] <= (float)CLOSE)) continue;
+        const int number = BODIES && wall[axis][BODIES ? q : 0] > 0 ? wall[axis][BODIES ? q : 0] : 0;
+        const bool emits = source(q, step[axis]);
+        bodies = bodies || (!emits && body[BODIES ? number : 0] >= 0);
+        const int owner = emits ? 1 << 16 : number;
+        several = several || (first_owner >= 0 && owner != first_owner);
+        first_owner = owner;
+    }
+    return several && bodies;
+};
 const auto let_go = [&](long long c) { return (kind[c] == FLUID) & (contact[c] == RELEASED); };
 const auto holds = [&](long long c) { return (kind[c] == FLUID) & (contact[c] != RELEASED); };
 for (int i = first; i < last; ++i) {
@@ -143,7 +166,8 @@ for (int i = first; i < last; ++i) {
                 const long long A = step[e < 2 ? 0 : 1], B = step[e < 1 ? 1 : 2],
                                 o = i + (corner & 1) * A + (corner >> 1) * B;
                 const long long cells[4] = {o - A - B, o - A, o - B, o};
-                if (filled(cells, 4) < 1.0f) walled = 0.0f;
+                if (filled(cells, 4) < 1.0f || apart(o, e < 2 ? 0 : 1, e < 1 ? 1 : 2))
+                    walled = 0.0f;
                 const float beside = viscosity(on_edges[e], o);
                 least = beside < least ? beside : least;
                 most = beside > most ? beside : most;
@@ -183,7 +207,7 @@ for (int i = first; i < last; ++i) {
                 !(h[axis][q] < INFINITY) ? 0.0f : (length * factor > 1.0f ? 1.0f / length : factor);
         }
         const float thickness = factor * scale * viscosity(on_edges[e], i);
-        edge[e][i] = wall && (released || !held) ? 0.0f : thickness * filled(cells, 4);
+        edge[e][i] = wall && (released || !held || apart(i, a, b)) ? 0.0f : thickness * filled(cells, 4);
     }
 }
 

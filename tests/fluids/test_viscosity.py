@@ -949,3 +949,30 @@ def test_the_core_of_a_row_is_its_longest_run_of_equal_equations(dimension: int)
         np.testing.assert_array_equal(found[k, j], [unknowns[0], end, *core])
         lengths.add(longest)
     assert len(lengths) > 2
+
+
+def test_the_drag_of_bodies_that_nearly_touch_is_dissipative() -> None:
+    """A little liquid between two balls less than a cell apart: D has no negative eigenvalue."""
+    rng = np.random.default_rng(417)
+    for _ in range(4):
+        middle, way = 0.5 + rng.uniform(-0.05, 0.05, 3), rng.standard_normal(3)
+        way *= 0.105 / np.linalg.norm(way)
+        side = np.cross(way, rng.standard_normal(3))
+        place = middle + 0.09 * side / np.linalg.norm(side)
+        ball = {"shape": "sphere", "radius": 0.1, "density": 40.0, "wall": "sticky"}
+        simulation = create(
+            scene(
+                size=[1.0, 1.0, 1.0],
+                resolution=16,
+                liquid=[box((place - 0.1).tolist(), (place + 0.1).tolist())],
+                solid=[
+                    ball | {"center": (middle + turn * way).tolist(), "slip_length": 0.4}
+                    for turn in (-1.0, 1.0)
+                ],
+                wall="sticky",
+                viscosity={"value": 100.0, "splitting_tolerance": float("inf")},
+            )
+        )
+        simulation.step(0.005)
+        values = np.linalg.eigvalsh(simulation.viscosity.body_drag.factors()[1])
+        assert values[0] > -1e-6 * values[-1]

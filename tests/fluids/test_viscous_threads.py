@@ -8,7 +8,7 @@ from scipy.sparse import coo_matrix, csgraph
 from scipy.spatial import cKDTree
 
 from default_run import chosen
-from small_liquids import box, create, scene
+from small_liquids import GRAVITY, box, create, scene
 from viscous_scenes import hanging_thread
 from warp_lcp.fluids import LiquidSimulation
 
@@ -48,3 +48,30 @@ def test_a_droplet_falls_onto_a_thick_pool() -> None:
         simulation.step(min(simulation.stable_dt(), 0.02))
     count = sum(simulation.particles.exchange.counts)
     assert simulation.particles.position.numpy()[:count, 1].max() < 0.4 + 1.6 / 24
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_thick_drop_flies_along_its_parabola(dimension: int) -> None:
+    drop = {"shape": "sphere", "center": [0.3, 0.6, 0.5][:dimension], "radius": 0.13}
+    velocity = np.array([1.0, 1.5, -0.3][:dimension])
+    simulation = create(
+        scene(
+            size=[1.0] * dimension,
+            resolution=20 if dimension == 2 else 12,
+            wall="sticky",
+            liquid=[drop | {"velocity": velocity.tolist()}],
+            viscosity={"value": 1e3},
+        )
+    )
+
+    def middle() -> np.ndarray:
+        count = sum(simulation.particles.exchange.counts)
+        return simulation.particles.position.numpy()[:count, :dimension].astype(float).mean(axis=0)
+
+    start = middle()
+    for _ in range(15):
+        simulation.step(min(simulation.stable_dt(), 0.02))
+    t = simulation.time
+    expected = start + velocity * t
+    expected[1] -= 0.5 * GRAVITY * t**2
+    assert np.abs(middle() - expected).max() < 1e-4 * t
