@@ -1,8 +1,8 @@
 """Folding of a slender viscous sheet: its equations, integrated in time.
 
 A sheet leaves a nozzle straight down and folds periodically on a plate, in two dimensions. The
-equations are those of a thin sheet that is stretched and bent [Ribe 2003]: stresses are averaged
-over cross-sections. A chain of segments is integrated in time, without any code of the simulator.
+equations are those of a thin sheet that is stretched and bent [Ribe 2003]. A chain of segments
+follows the sheet, without any code of the simulator.
 
 Lengths are in fall heights H, speeds in speeds U of the nozzle, and forces in mu U.
 """
@@ -11,20 +11,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import solveh_banded
 
-SEGMENTS = 60  # segments over the fall height
+SEGMENTS = 80  # segments over the fall height
 STEP = 0.25  # step over the time in which the nozzle extrudes a segment
-TURN = 1.5  # length of sheet behind the contact that is not lain on [thickness]
-LONGEST_SEGMENT = 1.6  # over the first length; longer ones are divided
+LONGEST_SEGMENT = 1.6  # over the first length; longer ones are halved
 TILT = 0.1  # horizontal displacement of the first contact [H]
-COLUMNS = 400  # columns of the height map of laid sheet
-REACH = 1.5  # half its width [H]
-SLOW = 0.2  # speed relative to the plate below which sheet is laid [U]
-BAND = 5  # bending couples a node with the second next: 6 unknowns
-SETTLING_FOLDS = 4  # half periods that do not count
+BAND = 5  # lower diagonals: bending couples a node with the second next
+HELD = 3  # laid nodes that are kept
+SLOW = 0.2  # speed relative to the plate below which liquid counts as laid [U]
+LEVEL = 0.3  # height over the plate at which the sheet's position is taken [H]
+DURATION = 12.0  # of the motion [H / U]
+FOLDS = 12  # half periods at its end that are averaged
 
 
 @dataclass(frozen=True)
@@ -35,44 +37,39 @@ class Sheet:
         thickness: thickness at the nozzle over the fall height, h / H.
         gravity: rho g H^2 / (mu U).
         reynolds: rho U H / mu.
-        descent: speed at which the plate moves down [U].
     """
 
     thickness: float
     gravity: float = 0.0
     reynolds: float = 0.0
-    descent: float = 0.0
 
 
 @dataclass(frozen=True)
-class Folds:
-    """Motion of a folding sheet, in units of H and U; row n is at `time[n]`.
+class FoldingMotion:
+    """Motion of a folding sheet.
 
     Args:
-        sheet: its numbers.
-        time: times of the rows, shape (n,).
-        middle: horizontal position halfway down, shape (n,).
-        contact: horizontal position of the contact, shape (n,).
-        height: height from the nozzle to the laid sheet at the contact, shape (n,).
-        thickness: thickness at the contact, shape (n,).
+        time: times, shape (n,).
+        position: horizontal position of the sheet at `LEVEL`, shape (n,).
+        height: height from the nozzle down to the laid sheet's axis, shape (n,).
     """
 
-    sheet: Sheet
     time: np.ndarray
-    middle: np.ndarray
-    contact: np.ndarray
+    position: np.ndarray
     height: np.ndarray
-    thickness: np.ndarray
 
-    def reversals(self) -> np.ndarray:
-        """Return the times at which the middle passes its mean."""
-        return crossings(self.time, self.middle)
+    def folds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the half periods and the mean height of each, shape (m,)."""
+        times = crossings(self.time, self.position)
+        within = [(self.time >= t) & (self.time < u) for t, u in pairwise(times)]
+        return np.diff(times), np.array([self.height[part].mean() for part in within])
 
-    def frequency(self) -> float:
-        """Return the folding frequency [U / H]: inverse of the time of two folds."""
-        times = self.reversals()[SETTLING_FOLDS:]
-        pairs = (len(times) - 1) // 2
-        return pairs / float(times[2 * pairs] - times[0]) if pairs else math.nan
+    def frequency(self, folds: int) -> float:
+        """Return the frequency of folding over speed and inverse height, of the last folds."""
+        halves, heights = self.folds()
+        if len(halves) < folds:
+            return math.nan
+        return float(heights[-folds:].sum() / (2.0 * halves[-folds:].sum()))
 
 
 def crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -85,11 +82,13 @@ def crossings(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 class Chain:
     """Chain of segments of constant area, from the laid sheet up to the nozzle.
 
+    The plate is at y = 0, and laid sheet does not raise it.
+
     Attributes:
         nodes: positions, shape (n, 2); the nozzle is at (0, 1).
+        velocity: of the nodes, shape (n, 2).
         areas: areas of the segments, shape (n - 1,).
         laid: nodes from the start of the chain that lie on the plate.
-        pile: height of the laid sheet in each column, shape (COLUMNS,).
     """
 
     def __init__(self, sheet: Sheet, segments: int) -> None:
@@ -102,12 +101,6 @@ class Chain:
         self.velocity = np.zeros_like(self.nodes)
         self.velocity[:, 1] = -1.0
         self.laid = 2  # two nodes: the sheet does not turn at the contact
-        self.pile = np.zeros(COLUMNS)
-
-    def columns(self, x: np.ndarray) -> np.ndarray:
-        """Return the columns of the height map at horizontal positions."""
-        column = (x + REACH) / (2.0 * REACH) * COLUMNS
-        return np.clip(column.astype(int), 0, COLUMNS - 1)
 
     def strain_rates(self) -> tuple[np.ndarray, np.ndarray]:
         """Return length rates and turning rates as rows of coefficients, and viscosities.
@@ -140,7 +133,6 @@ class Chain:
         n = len(self.nodes)
         first_held = n - int((self.nodes[::-1, 1] > 1.0).argmin())
         velocity = np.zeros((n, 2))
-        velocity[: self.laid, 1] = -self.sheet.descent
         velocity[first_held:, 1] = -1.0
         mass = np.zeros(n)
         mass[1:] += 0.5 * self.areas
@@ -163,7 +155,6 @@ class Chain:
         velocity.ravel()[free] = solveh_banded(part, load[free], lower=True)
         self.velocity = velocity
         self.nodes += dt * velocity
-        self.pile -= dt * self.sheet.descent
         self.extrude()
         self.divide()
         self.lay()
@@ -188,37 +179,23 @@ class Chain:
             self.areas = np.insert(self.areas, long + 1, 0.5 * self.areas[long])
             self.areas[long + np.arange(len(long))] *= 0.5
 
-    def thickness_at(self, i: int) -> float:
-        """Return the thickness of the segment below node i [H]."""
-        return float(self.areas[i - 1] / np.linalg.norm(self.nodes[i] - self.nodes[i - 1]))
-
     def lay(self) -> None:
-        """Lay the sheet up to the last node that touches the plate or sheet laid before."""
-        along = np.linalg.norm(np.diff(self.nodes, axis=0), axis=1)
-        thickness = np.append(self.sheet.thickness, self.areas / along)
-        arc = np.append(0.0, along.cumsum())
-        x, y = self.nodes.T
-        touches = y - 0.5 * thickness <= self.pile[self.columns(x)]
-        # A sheet that turns back lies on what is farther behind it than the turn is long.
-        laid, free = slice(0, self.laid), slice(self.laid, None)
-        gap = self.nodes[free, None] - self.nodes[None, laid]
-        behind = arc[free, None] - arc[None, laid] > TURN * thickness[free, None]
-        near = np.hypot(gap[..., 0], gap[..., 1]) < thickness[free, None]
-        touches[free] |= (behind & near).any(axis=1)
-        self.laid = max(self.laid, len(y) - int(touches[::-1].argmax()) if touches.any() else 0)
-        old = int((arc[self.laid - 1] - arc[: self.laid] > 2.0 * TURN * thickness[: self.laid]).sum())
-        column = self.columns(x)
-        for i in range(1, min(old, self.laid - 2)):
-            low, high = sorted(column[i - 1 : i + 1])
-            part = self.pile[low : high + 1]
-            np.maximum(part, max(y[i - 1], y[i]) + 0.5 * thickness[i], out=part)
-        drop = max(0, min(old, self.laid - 2) - 1)
+        """Lay the sheet up to the last node at which its lower side touches the plate."""
+        length = np.linalg.norm(np.diff(self.nodes, axis=0), axis=1)
+        touches = np.flatnonzero(self.nodes[1:, 1] < 0.5 * self.areas / length)
+        if len(touches):
+            self.laid = max(self.laid, int(touches[-1]) + 2)
+            self.velocity[: self.laid] = 0.0
+        drop = max(0, self.laid - HELD)
         self.nodes, self.velocity = self.nodes[drop:], self.velocity[drop:]
         self.areas, self.laid = self.areas[drop:], self.laid - drop
 
 
-def folding_sheet(sheet: Sheet, duration: float, segments: int = SEGMENTS) -> Folds:
-    """Return the motion of a sheet from its first contact on.
+@cache
+def folding_sheet(
+    sheet: Sheet, duration: float = DURATION, segments: int = SEGMENTS
+) -> FoldingMotion:
+    """Return the motion of a sheet from its first contact on, in units of H and U.
 
     Args:
         sheet: the sheet.
@@ -226,18 +203,27 @@ def folding_sheet(sheet: Sheet, duration: float, segments: int = SEGMENTS) -> Fo
         segments: segments over the fall height.
     """
     chain, dt = Chain(sheet, segments), STEP / segments
-    rows = []
+    rows = list[tuple[float, float, float]]()
     for step in range(math.ceil(duration / dt)):
         chain.step(dt)
         x, y = chain.nodes[chain.laid - 1 :].T
-        first = int((y > 0.5).argmax())  # from below: the lowest crossing of half the height
-        part = (0.5 - y[first - 1]) / (y[first] - y[first - 1])
-        middle = x[first - 1] + part * (x[first] - x[first - 1])
-        slow = np.hypot(*(chain.velocity + [0.0, sheet.descent]).T) < SLOW
-        slow[chain.laid - 1] = True
-        top = chain.nodes[slow, 1].max()
-        rows.append((step * dt + dt, middle, x[0], 1.0 - top, chain.thickness_at(chain.laid)))
-    return Folds(sheet, *np.array(rows).T)
+        first = int((y > LEVEL).argmax())  # the lowest crossing
+        part = (LEVEL - y[first - 1]) / (y[first] - y[first - 1])
+        slow = np.hypot(*chain.velocity.T) < SLOW
+        rows.append(
+            (
+                (step + 1) * dt,
+                float(x[first - 1] + part * (x[first] - x[first - 1])),
+                1.0 - float(chain.nodes[slow, 1].max()),
+            )
+        )
+    return FoldingMotion(*np.array(rows).T)
+
+
+@cache
+def folding_frequency(sheet: Sheet) -> float:
+    """Return the frequency of periodic folding over U and the inverse height of its fall."""
+    return folding_sheet(sheet).frequency(FOLDS)
 
 
 def product(band: np.ndarray, x: np.ndarray) -> np.ndarray:
