@@ -11,6 +11,17 @@ from itertools import pairwise
 
 import numpy as np
 
+from warp_lcp.benchmarks.validation.coiling import (
+    FLOOR,
+    HEIGHT,
+    LONGEST,
+    REYNOLDS,
+    SHARE,
+    SOURCE,
+    SPEED,
+    STEP,
+    WITHIN,
+)
 from warp_lcp.benchmarks.validation.finding import Findings, ValidationCheck, check_at, plot
 from warp_lcp.benchmarks.validation.scenes import (
     DENSITY,
@@ -31,17 +42,9 @@ from warp_lcp.benchmarks.validation.sheet_theory import (
     folding_frequency,
 )
 
-SHARE = 0.05  # splitting error above which a step is solved at once
-LONGEST = 100.0  # [s] longer than any step
-SOURCE = 4  # cells of the source along the sheet
-FLOOR = 2  # cells below the plate at the end
-SPEED, HEIGHT = 0.02, 0.1  # [m/s] of the nozzle, [m] of its fall
-REYNOLDS = 0.005  # rho U H / mu
 WIDTH = 0.8  # half the domain's width over the height
-STEP = 0.8  # longest step [cells] at the nozzle's speed
 LAYER = 2  # slow particles over the sheet's cells in a layer of laid sheet
 SETTLING = 1  # folds that do not count
-WITHIN = 0.15  # tolerated error of a frequency
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ class FallingSheet:
         return Sheet(round(thickness, 6), round(gravity, 6), round(REYNOLDS * height, 8))
 
     def expected(self, height: float, *, heavy: bool = True) -> float:
-        """Return the frequency over U and the inverse height, of the theory."""
+        """Return the frequency in theory [U over the height]."""
         return folding_frequency(self.at(height, heavy=heavy))
 
 

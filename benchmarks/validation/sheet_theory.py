@@ -65,7 +65,7 @@ class FoldingMotion:
         return np.diff(times), np.array([self.height[part].mean() for part in within])
 
     def frequency(self, folds: int) -> float:
-        """Return the frequency of folding over speed and inverse height, of the last folds."""
+        """Return the frequency of the last folds [U over the mean height]."""
         halves, heights = self.folds()
         if len(halves) < folds:
             return math.nan
@@ -103,14 +103,14 @@ class Chain:
         self.laid = 2  # two nodes: the sheet does not turn at the contact
 
     def strain_rates(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return length rates and turning rates as rows of coefficients, and viscosities.
+        """Return coefficients of the rates of length and of turning.
 
         A segment's rate of length is t . (v1 - v0), its angular velocity n . (v1 - v0) / l. The
         dissipation is sum 4 mu h / l (l')^2 + sum mu h^3 / (3 l) (omega1 - omega0)^2.
 
         Returns:
-            Coefficients of 2 and 3 successive nodes, each row times the square root of its
-            viscosity, shapes (n - 1, 4) and (n - 2, 6).
+            Coefficients of the velocities of 2 and 3 successive nodes, times the square root of
+            the dissipation per squared rate, shapes (n - 1, 4) and (n - 2, 6).
         """
         along = np.diff(self.nodes, axis=0)
         length = np.linalg.norm(along, axis=1)
@@ -222,7 +222,7 @@ def folding_sheet(
 
 @cache
 def folding_frequency(sheet: Sheet) -> float:
-    """Return the frequency of periodic folding over U and the inverse height of its fall."""
+    """Return the frequency of periodic folding [U over the mean height]."""
     return folding_sheet(sheet).frequency(FOLDS)
 
 
