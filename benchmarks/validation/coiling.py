@@ -158,6 +158,7 @@ class FallingRope:
         turns: turns of the run.
         receding: whether the plate moves down by a diameter a turn.
         share: splitting error above which a step is solved at once.
+        level: height at which the phase is measured, over the fall height.
     """
 
     cells: int
@@ -166,6 +167,7 @@ class FallingRope:
     turns: float
     receding: bool
     share: float = SHARE
+    level: float = 0.5
 
     @property
     def spacing(self) -> float:
@@ -288,7 +290,7 @@ def falling_rope(setup: FallingRope) -> RopeMotion:
         time={"duration": LONGEST, "cfl": 16.0, "dt_max": STEP * dx / SPEED},
     )
     rows = list[tuple[float, float, float]]()
-    place = round(0.5 * (nozzle + plate))
+    place = round(plate + setup.level * (nozzle - plate))
     for _ in steps(simulation, duration):
         cells = simulation.particles.position.numpy() / dx
         layer = cells[:, 1].astype(int)
