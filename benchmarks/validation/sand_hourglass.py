@@ -53,7 +53,7 @@ LOW = 0.3  # fill down to which the liquid is measured
 PARTS = 5  # parts of the range
 WALLS = 0.4  # friction of the side walls
 
-# Rates / sqrt(g D^3) by Basilisk, silo2DCo.c without cohesion, on 128 cells: 1.9501, 1.6839, 1.4292,
+# Rates / sqrt(g D^3) by Basilisk, silo2DCo.c without cohesion on 128 cells: 1.9501, 1.6839, 1.4292,
 # 1.2190 and 1.0806 sqrt(g L^3). D is 12 of its cells, of 10 L / 128; mu_s is the key.
 # granular_sandglass.c, another set-up, has 1.525 with mu_s = 0.32, between these two.
 REFERENCE = {0.1: 2.148, 0.2: 1.855, 0.3: 1.574, 0.4: 1.343, 0.5: 1.190}
