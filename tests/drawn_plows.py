@@ -127,8 +127,9 @@ def run(plow: Plow) -> Plowed:
         else:  # it stops here
             failed = simulation.time
             break
-        densest.append(row["max_fraction"])
-        if row["max_fraction"] > LIMIT:
+        most = float(row["max_fraction"] or 0.0)
+        densest.append(most)
+        if most > LIMIT:
             x, y, share = densest_cell(simulation)
             front = plow.front + plow.speed * start
             where.append(((x - front) / plow.dx, y / plow.dx, share))
@@ -144,11 +145,12 @@ def main() -> None:
         plow = drawn(seed)
         out = run(plow)
         places = ", ".join(f"({x:.1f} {y:.1f} {c:.2f})" for x, y, c in out.where[:4])
+        stops = f", it stops at {out.failed:.3f} s" if math.isfinite(out.failed) else ""
         print(
             f"{seed} {plow.label}: densest {out.densest.max():.3f}, 95th percentile "
             f"{np.percentile(out.densest, 95):.3f}, {len(out.where)} of {len(out.densest)} steps "
-            f"beyond {LIMIT} at {places or 'none'}; {out.retried} failed{f' and it stops at {out.failed:.3f} s' * math.isfinite(out.failed)}, {100 * out.solved:.0f} % "
-            f"solved, {out.seconds:.1f} s",
+            f"beyond {LIMIT} at {places or 'none'}; {out.retried} failed{stops}, "
+            f"{100 * out.solved:.0f} % solved, {out.seconds:.1f} s",
             flush=True,
         )
 
