@@ -6,8 +6,8 @@ from default_run import slow
 from drawn_plows import LIMIT, drawn, run
 
 
-# 30 stopped in a jam; a cell held up to 1.41, 1.34, 1.20, 1.17 and 1.15 of its share in the others.
-@pytest.mark.parametrize("seed", [30, 21, 23, slow(5), slow(19), slow(67)])
+# 30 stopped in a jam; a cell held up to 1.41, 1.15, 1.34, 1.20, 1.17 and 1.15 in the others.
+@pytest.mark.parametrize("seed", [30, 21, 56, slow(23), slow(5), slow(19), slow(67)])
 def test_plowed_sand_does_not_jam_and_keeps_its_density(seed: int) -> None:
     out = run(drawn(seed))
     assert out.failed == float("inf")
