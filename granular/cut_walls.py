@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from warp_lcp.granular.stress import Velocity
 
 SAMPLES = {2: 8, 3: 4}  # sample points of a half cell along each axis, for its volume
+CELLS_AT_ONCE = 512  # of which all sample points are in memory
 LEAST_WALL = 1e-4  # least area of a wall in a cell, in units of a face
 ENTRY, VELOCITY = 8, 3  # numbers of a wall for its kernel; those of its velocity
 LEAST_LISTED = 256  # least length of a list of walls, where solids move
@@ -410,11 +411,19 @@ def _open_part(
         a + (b - a) * (np.arange(samples) + 0.5) / samples for a, b in zip(low, high, strict=True)
     ]
     step = max(b - a for a, b in zip(low, high, strict=True)) / samples
-    for point in itertools.product(*places):
-        value = corners
-        for x in reversed(point):
-            value = (1.0 - x) * value[0] + x * value[1]
-        total += np.clip(0.5 + value / step, 0.0, 1.0)
+    for first in range(0, len(total), CELLS_AT_ONCE):
+        value = corners[..., first : first + CELLS_AT_ONCE]
+        # Interpolate along one axis of the cube after the other: its places come first.
+        for known, along in enumerate(reversed(places)):
+            x = along.reshape(-1, *(1,) * (value.ndim - 1))
+            below, above = value.take(0, axis=known), value.take(1, axis=known)
+            value = (1.0 - x) * below + x * above
+        value /= step
+        value += 0.5
+        np.clip(value, 0.0, 1.0, out=value)
+        # One after the other, since sums of another order have other bits.
+        for part in value.reshape(-1, value.shape[-1]):
+            total[first : first + CELLS_AT_ONCE] += part
     return total / samples ** len(places)
 
 

@@ -222,7 +222,9 @@ def front_kernel(
 
     Where moving walls free space in a cell at the rate `swept` [m/s], the last layer of `openings`
     gets the part of it that counts for the cell's sand: all in full cells, its fraction in loose
-    ones, as on faces.
+    ones, as on faces. Cells filled less than the surface have no pressure: walls that close them
+    take at most their free volume. A sliver of a cell with a few grains would otherwise count as
+    full, and no face could let out what the walls sweep.
     """
     # w = drive + div(m' u) as in the snippet `divergence` of `sand.h`, at the velocity u before the
     # stresses, and div u; both times dx [m/s]. With drive = 0 the first becomes the second.
@@ -250,7 +252,10 @@ def front_kernel(
         full = float(1.0)
     if swept:
         phi = fraction[k, j, i]
-        openings[2 * dimension, k, j, i] = (phi + full * (1.0 - phi)) * swept[k, j, i]
+        counted = (phi + full * (1.0 - phi)) * swept[k, j, i]
+        if phi < SURFACE:
+            counted = wp.max(counted, -drive[k, j, i])
+        openings[2 * dimension, k, j, i] = counted
 
 
 @wp.func

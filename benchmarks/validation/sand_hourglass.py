@@ -3,6 +3,12 @@
 The rate does not depend on the fill and grows as (D - delta)^(3/2) with the slot D. The discharge
 of a liquid falls with the square root of its height. The bin's floor is rough: its friction is the
 sand's own. delta is a property of grains; in a continuum it is near 0.
+
+The constant of the law depends on the friction and on the outlet. The trial `reference` takes the
+set-up of a continuum code with mu(I), Basilisk [silo2DCo.c]: an incompressible fluid of yield
+stress mu(I) p, with a volume fraction and no grain's size but in I. There the slot is part of the
+bottom of the domain, and the pressure in it is 0: here sand is removed below the floor's surface.
+Walls and floor hold the fluid. Rates are volumes of the bulk, not of grains.
 """
 
 from __future__ import annotations
@@ -20,6 +26,7 @@ from warp_lcp.benchmarks.validation.finding import (
     ValidationCheck,
     ValidationTrial,
     attempt,
+    check_at,
     plot,
 )
 from warp_lcp.benchmarks.validation.scenes import (
@@ -45,6 +52,17 @@ FIRST, LEAST = 1.65, 1.2
 LOW = 0.3  # fill down to which the liquid is measured
 PARTS = 5  # parts of the range
 WALLS = 0.4  # friction of the side walls
+
+# Rates / sqrt(g D^3) by Basilisk, silo2DCo.c without cohesion on 128 cells: 1.9501, 1.6839, 1.4292,
+# 1.2190 and 1.0806 sqrt(g L^3). D is 12 of its cells, of 10 L / 128; mu_s is the key.
+# granular_sandglass.c, another set-up, has 1.525 with mu_s = 0.32, between these two.
+REFERENCE = {0.1: 2.148, 0.2: 1.855, 0.3: 1.574, 0.4: 1.343, 0.5: 1.190}
+REFERENCE_CELLS = (12, 24)  # cells of the slot
+# mu(I): growth of mu, I_0, and diameter of grains over the slot's width.
+GROWTH, INERTIAL_NUMBER, GRAIN = 0.28, 0.4, 1.0 / 30.0 * 12.8 / 12.0
+BASIN, FILLED = 128.0 / 12.0, 57.6 / 12.0  # width of the silo and height of its sand [slots]
+OUTFLOW = (3.0, 4.0)  # time in which the rate is measured [sqrt(D / g)]
+JET = 6  # cells below the floor's surface
 
 
 class Discharge(NamedTuple):
@@ -164,6 +182,91 @@ def liquid(cells: int) -> tuple[Discharge, Discharge]:
     )
 
 
+@check_at("sand hourglass", "rates by another code, D = {cells} cells")
+def reference(
+    findings: Findings, cells: int, frictions: tuple[float, ...] = tuple(REFERENCE)
+) -> None:
+    """Compare rates with those of a continuum code.
+
+    The controls are the friction of Narain et al., whose set is a box, and half of the friction.
+    """
+    rates = [silo_rate(cells, mu) for mu in frictions]
+    for mu, rate in zip(frictions, rates, strict=True):
+        findings.add(
+            f"mu_s = {mu:g}: rate / sqrt(g D^3) over the reference's",
+            rate / REFERENCE[mu],
+            low=0.92,
+            high=1.08,
+        )
+    findings.curve("rate", frictions, rates)
+    steep = frictions[-1]
+    for label, rate in (
+        ("box", silo_rate(cells, steep, friction={"model": "box"})),
+        ("half of the friction", silo_rate(cells, 0.5 * steep)),
+    ):
+        findings.must_break(
+            f"{label}, mu_s = {steep:g}: rate / sqrt(g D^3) over the reference's",
+            rate / REFERENCE[steep],
+            low=0.92,
+            high=1.08,
+        )
+
+
+def silo_rate(cells: int, mu: float, *, plate: float = JET, **tables: TableValue) -> float:
+    """Return rate / sqrt(g D^3) of sand that leaves a silo through a slot in its floor.
+
+    Args:
+        cells: cells of the slot, an even number.
+        mu: mu_s.
+        plate: thickness of the floor [cells].
+        tables: further tables of the scene; `friction` replaces mu(I).
+    """
+    dx = SPACING
+    slot, top = cells * dx, JET * dx
+    # The slot's sides are faces of the grid if their numbers of cells are even.
+    width, fill = 2 * round(0.5 * BASIN * cells) * dx, round(FILLED * cells) * dx
+    left, right = 0.5 * (width - slot), 0.5 * (width + slot)
+    low = top - plate * dx
+    solids = [
+        box([-1.0, low], [left, top], friction="stick"),
+        box([right, low], [width + 1.0, top], friction="stick"),
+    ]
+
+    def angle(tangent: float) -> float:
+        return math.degrees(math.atan(tangent))
+
+    scene: Tables = CORRECTED | {
+        "material": {
+            "friction_angle": angle(mu),
+            "friction_angle_test": "simple-shear",
+            "max_fraction": 0.6,
+        },
+        # I of the reference has the density of the bulk, ours that of grains.
+        "friction": {
+            "dynamic_angle": angle(mu + GROWTH),
+            "inertial_number": INERTIAL_NUMBER,
+            "grain_size": GRAIN * slot * math.sqrt(0.6),
+        },
+    }
+    size = [width, top + fill + 4.0 * dx]
+    simulation = create_sand(
+        size,
+        round(max(size) / dx),
+        [box([0.0, top], [width, top + fill])],
+        solids,
+        walls="stick",
+        drain=[box([-1.0, -1.0], [width + 1.0, top])],
+        **(scene | tables),
+    )
+    area = simulation.particle_mass / simulation.scene.physics.density
+    unit, time, left_over = math.sqrt(slot / GRAVITY), [0.0], [simulation.particles.count]
+    for row in steps(simulation, OUTFLOW[1] * unit):
+        time.append(row["time"])
+        left_over.append(simulation.particles.count)
+    first, last = np.interp(np.array(OUTFLOW) * unit, time, left_over)
+    return float((first - last) * area / (np.ptp(OUTFLOW) * unit)) / math.sqrt(GRAVITY * slot**3)
+
+
 def _empty(
     simulation: scenes.Simulation, area: float, low: float, rows: list[Row]
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -218,7 +321,7 @@ def _law(trials: Sequence[ValidationTrial]) -> RecordLines:
 
 CHECK = ValidationCheck(
     about=__doc__ or "",
-    trials=[(trial, tuple(OPENINGS))],
+    trials=[(trial, tuple(OPENINGS)), (reference, REFERENCE_CELLS)],
     charts=[
         plot(
             "sand-discharge",
@@ -229,6 +332,15 @@ CHECK = ValidationCheck(
             "liquid",
         ),
         _law,
+        plot(
+            "sand-silo-rate",
+            "Discharge of a silo over its friction",
+            "mu_s",
+            "rate / sqrt(g D^3)",
+            "rate",
+            exact={"Basilisk": (list(REFERENCE), list(REFERENCE.values()))},
+            marked=("Basilisk",),
+        ),
     ],
     known="deep sand that yields everywhere: 10 % of the steps at the narrowest slot miss the "
     "error",

@@ -60,6 +60,16 @@ def test_sand_runs_out_evenly(cells: int, monkeypatch: pytest.MonkeyPatch) -> No
     assert d.rate.mean() == pytest.approx((9.81 * (0.01 * cells) ** 3) ** 0.5, rel=0.3)
 
 
+@pytest.mark.parametrize("mu", [0.1, 0.3, 0.5])
+def test_the_rate_of_a_silo_depends_on_the_friction_as_in_another_code(mu: float) -> None:
+    """Rates of Basilisk.
+
+    Half of the friction would be 46 % off, the box model 19 %.
+    """
+    expected = sand_hourglass.REFERENCE[mu]
+    assert sand_hourglass.silo_rate(8, mu) == pytest.approx(expected, rel=0.08)
+
+
 def test_rates_are_areas_over_times() -> None:
     time = np.linspace(0.0, 10.0, 200)
     width = sand_hourglass.WIDTH

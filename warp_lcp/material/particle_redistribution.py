@@ -12,7 +12,7 @@ from warp_lcp.grid.level_set import Fill
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
 from warp_lcp.material.boundary import Boundary
-from warp_lcp.material.density_correction import DensityCorrection
+from warp_lcp.material.density_correction import Correction, DensityCorrection
 from warp_lcp.material.particle_assembly import (
     make_density_correction,
     make_density_monitor,
@@ -28,6 +28,11 @@ PACE = 2.0  # factor on sqrt(dx / g): time in which an automatic correction remo
 # Splashes among solids at rest have up to 0.034. Motions of rigid bodies do not count.
 SEVERE, SEVERE_THIN = 0.03, 0.003
 PASSES = 8  # most corrections in a step
+# Sand that solids push: a correction that began with a cell above this density, relative to the
+# densest packing, is repeated; a cell whose kernel is open by two thirds then holds 1.10 of its
+# share. And most corrections in a step: each moves particles by up to half a cell, and a window has
+# two cells to spare.
+CROWDED_CELL, CROWDED_PASSES = 1.065, 4
 # Largest density of a cell, relative to rest, beside driven thin solids; the least is 2 minus it.
 MOST_THIN = 1.02
 
@@ -47,6 +52,9 @@ class ParticleRedistribution:
     than a fraction `SEVERE` is in excess (`SEVERE_THIN` where thin solids move), a correction
     removes more, up to all of the excess from twice that fraction on. A correction moves particles
     by half a cell at most, and is then repeated until less than that fraction is in excess.
+
+    Sand that moving solids push is corrected in every step. The correction is repeated while a cell
+    holds more than `CROWDED_CELL`: a kernel spreads over cells what a blade sweeps out of one.
 
     Walls that turn leave gaps: particles go straight on within a step, and along a wall at distance
     h from the center of its rotation, at omega [1/s], they depart from it by about omega^2 h dt^2 /
@@ -71,9 +79,11 @@ class ParticleRedistribution:
         self._scene, self._grid, self._boundary = scene, grid, boundary
         self.reseeding = make_reseeding(scene, grid, boundary)
         self.density_monitor = make_density_monitor(scene, grid, boundary)
-        driven = scene.keeps_volume and any(solid.motion is not None for solid in scene.solid)
+        moved = any(solid.motion is not None for solid in scene.solid)
+        driven = scene.keeps_volume and moved
         thin = boundary.thin is not None and boundary.thin.moves
         self._severe = (SEVERE_THIN if thin else SEVERE) if driven else math.inf
+        self._crowded = math.inf if scene.keeps_volume or not moved else CROWDED_CELL
         # Whether each step corrects all of the density.
         self._always = driven and thin and self.density_monitor is not None
         self.correction: DensityCorrection | None = None
@@ -174,6 +184,7 @@ class ParticleRedistribution:
                 iterations = done.result.iterations if done.result is not None else 0
                 if share == 1.0 and done.result is not None:
                     iterations += self._repeat(correction, particles, window, step, fill, contact)
+                    iterations += self._spread(correction, done, particles, window, step, contact)
             self.moved = self.moved or done.result is not None
             row["density_status"] = (
                 done.result.status.name if done.result is not None else "NOTHING_TO_DO"
@@ -218,6 +229,38 @@ class ParticleRedistribution:
             if done.result is None:
                 break
             iterations += done.result.iterations
+        return iterations
+
+    def _spread(
+        self,
+        correction: DensityCorrection,
+        done: Correction,
+        particles: Particles,
+        window: Window,
+        step: int,
+        contact: wp.array | None,
+    ) -> int:
+        """Repeat a correction of sand while it finds crowded cells; collective.
+
+        Args:
+            correction: the correction, which has moved the particles once in the step.
+            done: its result.
+            particles: the material (moved).
+            window: cells that hold all particles, with two to spare on each side.
+            step: its number.
+            contact: see `apply`.
+
+        Returns:
+            The number of iterations of the solves.
+        """
+        iterations = 0
+        for _ in range(CROWDED_PASSES - 1):
+            if done.max_density <= self._crowded or done.result is None:
+                break
+            particles.arrange(step)
+            particles.drop_ghosts()
+            done = correction.apply(particles, window, contact=contact)
+            iterations += done.result.iterations if done.result is not None else 0
         return iterations
 
     def _evens(self, step: int) -> bool:
