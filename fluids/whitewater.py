@@ -87,6 +87,7 @@ class Whitewater:
     def __init__(self, scene: LiquidScene, grid: StaggeredGrid) -> None:
         settings = scene.whitewater
         assert settings is not None, "the scene has whitewater"
+        self._solids = bool(scene.solid)
         self.settings = settings.resolved(
             longest=None if scene.domain.boundless else max(scene.domain.size),
             spacing=grid.spacing,
@@ -212,10 +213,14 @@ class Whitewater:
         components = [velocity[0], velocity[1], velocity[-1]]
         window.launch(kernels.center_kernel, [grid.planes, *components, phi, self._centers])
         fields.planes, fields.dx = grid.planes, grid.spacing
-        fields.cut, fields.origin = int(boundary.distance is not None), wp.vec3i(*grid.origin)
+        fields.origin = wp.vec3i(*grid.origin)
         fields.low, fields.high = (wp.vec3(*corner) for corner in self._limits(boundary))
         fields.centers, fields.base = self._centers, boundary.base
+        # Arrays that the kernels do not read with these walls are others of their type.
         fields.distance = phi if boundary.distance is None else boundary.distance
+        fields.room = boundary.base if boundary.room is None else boundary.room
+        whole = kernels.CELLS if self._solids else kernels.NONE
+        fields.walls = kernels.CUT if boundary.room is None else whole
         return fields
 
     def _limits(self, boundary: Boundary) -> tuple[list[float], list[float]]:
