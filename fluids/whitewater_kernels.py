@@ -86,7 +86,8 @@ class EmissionSettings:
     """Numbers of the emission in a step.
 
     A cell is sampled with the probability `share`, and stands for a cube of side `spread` [cells].
-    It gives at most `most` particles in a step. `reach` is the distance of compared points [cells]
+    It draws at most `most` particles in a step, of which the fraction `youngest` is written, rounded
+    up to a particle. `reach` is the distance of compared points [cells]
     in `directions`, `count` of them. `trapped` and `crest` are particles of a full potential per
     sampled cell in the step, by volume and by area. The potentials rise over `trapped_air_range`
     [m/s], `crest_range` (dimensionless) and `energy_range` [m^2/s^2].
@@ -96,6 +97,7 @@ class EmissionSettings:
     step: int
     count: int
     most: int
+    youngest: float
     share: float
     spread: float
     reach: float
@@ -300,6 +302,21 @@ def center_kernel(k, j, i, planes: int, u: F32, v: F32, w: F32, phi: F32, center
     )
 
 
+@wp.func
+def drawn_count(E: EmissionSettings, h: wp.uint32, mean: float):
+    """Return a random integer of a given mean, at most `most`."""
+    count = E.most
+    if mean < float(E.most):  # larger numbers may not be integers of 32 bits
+        count = int(mean + uniform(h, 3))
+    return count
+
+
+@wp.func
+def unwritten_count(E: EmissionSettings, drawn: int):
+    """Return how many of a cell's new particles are too many: the oldest, which are first."""
+    return wp.min(int((1.0 - E.youngest) * float(drawn)), drawn)
+
+
 @cell_kernel(MODULE)
 def count_kernel(k, j, i, F: LiquidFields, E: EmissionSettings, ends: I32):
     """Draw the number of new particles of each sampled cell, with the mean of `emission`."""
@@ -312,10 +329,8 @@ def count_kernel(k, j, i, F: LiquidFields, E: EmissionSettings, ends: I32):
                     X = sample_point(h, 0, 1.0, k, j, i)
                     trapped, crest, _normal, _v = emission(F, E, X)
                     if trapped + crest > 0.0:
-                        ends[k, j, i] = E.most
-                        # Larger numbers may not be integers of 32 bits.
-                        if trapped + crest < float(E.most):
-                            ends[k, j, i] = int(trapped + crest + uniform(h, 3))
+                        drawn = drawn_count(E, h, trapped + crest)
+                        ends[k, j, i] = drawn - unwritten_count(E, drawn)
 
 
 @cell_kernel(MODULE)
@@ -326,17 +341,17 @@ def emit_kernel(
     F: LiquidFields,
     E: EmissionSettings,
     ends: I32,
-    skipped: int,
     old: int,
     position: POINTS,
     velocity: POINTS,
     state: POINTS,
 ):
-    """Write the new particles of each cell behind the `old` ones, without the first `skipped`.
+    """Write the new particles of each cell behind the `old` ones.
 
     `ends` are the inclusive sums of the cells' numbers, in the order of cells. Particles from
     trapped air begin anywhere in the cube that the cell stands for, those from a crest above the
-    surface in it. Both begin at a random time of the step: their age at its start is in (-dt, 0].
+    surface in it. Both begin at a random time of the step: of n particles of a cell the one with
+    the number q has the age -dt (q + r) / n at its start, 0 <= r < 1.
     """
     last = ends[k, j, i]
     place = (k * ends.shape[1] + j) * ends.shape[2] + i
@@ -348,12 +363,15 @@ def emit_kernel(
             first = ends[k, j - 1, ends.shape[2] - 1]
         else:
             first = ends[k - 1, ends.shape[1] - 1, ends.shape[2] - 1]
-    if last > wp.max(first, skipped):
+    if last > first:
         h = cell_hash(F, E, k, j, i)
         X = sample_point(h, 0, 1.0, k, j, i)
         trapped, crest, normal, v = emission(F, E, X)
-        for q in range(wp.max(skipped - first, 0), last - first):
-            slot = old + first + q - skipped
+        # `ends` decides how many are written, whatever the rounding of the mean in this kernel.
+        drawn = wp.max(drawn_count(E, h, trapped + crest), last - first)
+        unwritten = drawn - (last - first)
+        for q in range(unwritten, drawn):
+            slot = old + first + q - unwritten
             own = hashed(h, wp.uint32(16 + q))
             Y = sample_point(own, 0, E.spread, k, j, i)
             if uniform(own, 3) * (trapped + crest) >= trapped:
@@ -374,7 +392,7 @@ def emit_kernel(
                 x[2] = 0.0
             position[slot] = x
             velocity[slot] = v + _SPREAD * wp.length(v) * beside
-            age = -E.dt * uniform(own, 8)
+            age = -E.dt * (float(q) + uniform(own, 8)) / float(drawn)
             life = E.lifetime * (0.5 + uniform(own, 9))
             state[slot] = wp.vec3(age, life, float(_FOAM))
 
@@ -576,12 +594,6 @@ def advance_kernel(
     position[i] = x
     velocity[i] = v
     state[i] = wp.vec3(age + M.dt, life, float(kind))
-
-
-@list_kernel(MODULE)
-def mark_first_kernel(i, count: int, marks: INTS):
-    """Mark the first particles, which are the oldest."""
-    marks[i] = wp.where(i < count, 1, 0)
 
 
 @list_kernel(MODULE)

@@ -18,8 +18,9 @@ from small_runs import StepCounter, run_into, written_files
 from warp_lcp.extras.export import export_run
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.fluids import whitewater_kernels as kernels
-from warp_lcp.fluids.whitewater import COLUMNS, KINDS, STATE, directions
+from warp_lcp.fluids.whitewater import COLUMNS, KINDS, STATE, directions, oldest
 from warp_lcp.fluids.whitewater_table import WhitewaterSettings
+from warp_lcp.grid.grid_part import ONE_PROCESS
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.render.recording import Recording
@@ -144,7 +145,7 @@ def test_a_state_without_whitewater_or_with_a_wrong_one_is_refused() -> None:
     with pytest.raises(ValueError, match="lacks whitewater_position"):
         splash().restore({name: a for name, a in state.items() if name not in STATE})
     bad = state | {"whitewater_velocity": np.zeros((7, 3), dtype=np.float32)}
-    with pytest.raises(ValueError, match="whitewater has a velocity of"):
+    with pytest.raises(ValueError, match="whitewater_velocity is float32"):
         splash().restore(bad)
 
 
@@ -241,6 +242,19 @@ def test_the_oldest_go_if_there_are_too_many() -> None:
     assert (np.diff(ages) <= 0.011).all()  # the first are the oldest, up to a step
 
 
+def test_of_equal_ages_those_with_the_least_life_go_first() -> None:
+    """The choice does not depend on the order of the particles."""
+    rng = np.random.default_rng(8)
+    age, life = rng.integers(0, 4, 60), rng.permutation(60)
+    state = np.column_stack([age, life, age]).astype(np.float32)
+    position = rng.random((60, 3)).astype(np.float32)
+    for count in (1, 17, 59, 60):
+        expected = np.lexsort([life, -age])[:count]
+        for order in (np.arange(60), rng.permutation(60)):
+            found = order[oldest(state[order], position[order], count, ONE_PROCESS)]
+            np.testing.assert_array_equal(np.sort(found), np.sort(expected))
+
+
 def test_huge_rates_take_no_more_memory_than_the_largest_number() -> None:
     def first_emission(rate: float, most: int) -> Any:
         """Return a splash after its first step that emits particles."""
@@ -254,8 +268,9 @@ def test_huge_rates_take_no_more_memory_than_the_largest_number() -> None:
     limited, removed = first_emission(1e7, 40)
     assert none == 0
     assert removed == every.whitewater.particles.count - 40
+    youngest = np.sort(np.argsort(arrays_of(every)["whitewater_state"][:, 0], kind="stable")[:40])
     for name, array in arrays_of(limited).items():
-        np.testing.assert_array_equal(array, arrays_of(every)[name][-40:])
+        np.testing.assert_array_equal(array, arrays_of(every)[name][youngest])
     # More than integers of 32 bits can count.
     huge, removed = first_emission(1e17, 40)
     assert huge.whitewater.particles.count == 40
