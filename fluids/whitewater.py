@@ -115,15 +115,9 @@ class Whitewater:
     columns = COLUMNS
 
     def __init__(self, scene: LiquidScene, grid: StaggeredGrid) -> None:
-        settings = scene.whitewater
+        settings = scene.resolved_whitewater
         assert settings is not None, "the scene has whitewater"
-        self._solids = bool(scene.solid)
-        self.settings = settings.resolved(
-            longest=None if scene.domain.boundless else max(scene.domain.size),
-            spacing=grid.spacing,
-            gravity=scene.physics.gravity,
-            dimension=grid.dimension,
-        )
+        self.settings, self._solids = settings, bool(scene.solid)
         nothing = np.zeros((0, 3), dtype=np.float32)
         self.particles = Particles(
             grid, nothing, nothing, affine=False, kept=nothing[:, 0], indexed=False
@@ -304,10 +298,7 @@ class Whitewater:
             own.launch(kernels.emit_kernel, inputs)
 
     def _count(
-        self,
-        own: Window | None,
-        fields: kernels.LiquidFields,
-        numbers: kernels.EmissionSettings,
+        self, own: Window | None, fields: kernels.LiquidFields, numbers: kernels.EmissionSettings
     ) -> int:
         """Sum up the cells' numbers of new particles in `_ends`; return the last sum."""
         if own is None:

@@ -506,7 +506,7 @@ def free_way(F: LiquidFields, x: wp.vec3, X: wp.vec3):
 
 
 @wp.func
-def move_among_walls(F: LiquidFields, x: wp.vec3, v: wp.vec3, h: float, way: float):
+def move_among_walls(F: LiquidFields, x: wp.vec3, v: wp.vec3, dt: float, way: float):
     """Move a particle by strides of at most half a cell; solids and sides stop it.
 
     Returns:
@@ -515,7 +515,7 @@ def move_among_walls(F: LiquidFields, x: wp.vec3, v: wp.vec3, h: float, way: flo
     depth = float(0.0)
     stopped = int(0)
     parts = wp.clamp(int(way / _STRIDE) + 1, 1, _STRIDES)
-    stride = h / float(parts)
+    stride = dt / float(parts)
     for _part in range(parts):
         if F.walls == _CUT:
             x, v, hit, depth = keep_distance(F, x + stride * v, v)
@@ -545,10 +545,11 @@ def advance_kernel(
         bubble  v <- (v + h b + h c u(x)) / (1 + h c)     drift b / c against gravity
         foam    v <- u(x + h/2 u(x))                      midpoint rule
 
-    then x <- x + h v, in strides where a solid may be on the way. The domain's sides are planes
-    normal to the axes, so that one stride suffices there. Drags are implicit, stable for any h.
-    `state` is the age, the rest of the life [s] and the kind. Foam, and spray that a wall stops,
-    lose life.
+    then x <- x + dt v, in strides where a solid may be on the way. Before its birth a new particle
+    goes with the liquid: its place was drawn in the liquid of the step's start. The domain's sides
+    are planes normal to the axes, so that one stride suffices there. Drags are implicit, stable for
+    any h. `state` is the age, the rest of the life [s] and the kind. Foam, and spray that a wall
+    stops, lose life.
     """
     x = position[i]
     v = velocity[i]
@@ -579,13 +580,13 @@ def advance_kernel(
     depth = float(0.0)
     stopped = int(0)
     if F.walls == _NONE:
-        x, v, stopped = stay_inside(F, x + h * v, v)
+        x, v, stopped = stay_inside(F, x + M.dt * v, v)
     else:
-        way = h * wp.length(v) / F.dx
+        way = M.dt * wp.length(v) / F.dx
         if way < free:
-            x = x + h * v
+            x = x + M.dt * v
         else:
-            x, v, stopped, depth = move_among_walls(F, x, v, h, way)
+            x, v, stopped, depth = move_among_walls(F, x, v, M.dt, way)
     if kind == _FOAM or stopped > 0:
         life -= h
     marks[i] = 0
