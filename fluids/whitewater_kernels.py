@@ -366,9 +366,17 @@ def emit_kernel(
     if last > first:
         h = cell_hash(F, E, k, j, i)
         X = sample_point(h, 0, 1.0, k, j, i)
-        trapped, crest, normal, v = emission(F, E, X)
+        trapped = float(1.0)
+        crest = float(0.0)
+        normal = wp.vec3(0.0, 0.0, 0.0)
+        v, depth = liquid_at(F, X)
+        if depth > -1.0:  # deeper cells have no crest
+            trapped, crest, normal, _v = emission(F, E, X)
         # `ends` decides how many are written, whatever the rounding of the mean in this kernel.
-        drawn = wp.max(drawn_count(E, h, trapped + crest), last - first)
+        drawn = last - first
+        if E.youngest < 1.0:
+            trapped, crest, normal, _v = emission(F, E, X)
+            drawn = wp.max(drawn_count(E, h, trapped + crest), drawn)
         unwritten = drawn - (last - first)
         for q in range(unwritten, drawn):
             slot = old + first + q - unwritten
