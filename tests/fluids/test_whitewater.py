@@ -172,6 +172,21 @@ def test_spray_flies_along_its_parabola() -> None:
     assert now["whitewater_state"][0, 2] == SPRAY
 
 
+def test_a_new_particle_goes_with_the_liquid_before_its_birth() -> None:
+    """It moves for the whole step, and falls for the rest of it."""
+    simulation = create(scene(size=[1.0, 0.5], resolution=24, liquid=FALLING[2][:1], **QUIET))
+    put(simulation, [[0.3, 0.4, 0.0]], [[1.0, 0.5, 0.0]])
+    state = arrays_of(simulation)
+    state["whitewater_state"][0, 0] = -0.0025
+    simulation.whitewater.restore(state)
+    stepped(simulation, 1)
+    now, fall = arrays_of(simulation), 9.81 * 0.0075
+    np.testing.assert_allclose(now["whitewater_velocity"][0], [1.0, 0.5 - fall, 0.0], atol=1e-5)
+    height = 0.4 + 0.01 * (0.5 - fall)
+    np.testing.assert_allclose(now["whitewater_position"][0], [0.31, height, 0.0], atol=1e-5)
+    assert now["whitewater_state"][0, 0] == pytest.approx(0.0075)
+
+
 def test_a_bubble_rises_at_its_speed_and_becomes_foam() -> None:
     deep = [box([0.0, 0.0], [1.0, 0.4])]
     simulation = create(scene(size=[1.0, 0.5], resolution=24, liquid=deep, **QUIET))
@@ -479,6 +494,29 @@ def test_approach_of_liquid(dimension: int) -> None:
     )
     for flow in (turning, spreading):
         assert emission_at(dimension, full, flow, at, reach)[0][0] == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_approach_of_two_streams_does_not_depend_on_the_width_of_their_front(
+    dimension: int,
+) -> None:
+    """Its integral across the front is 4 U R mean(r_x^2), however far cells spread the front."""
+    speed, reach, step = 0.5, 4.0, 0.25
+    x = np.arange(8.0, 33.0, step)
+    points = np.column_stack([x, 0.0 * x + 20.5, 0.0 * x + (20.5 if dimension == 3 else 1.5)])
+    r = directions(dimension).astype(np.float64)
+    expected = 4.0 * speed * reach * (r[:, 0] ** 2).mean()
+
+    def full(x: Any, y: Any, z: Any) -> Any:
+        return 0.0 * x - 3.0
+
+    for width in (2.0, 4.0, 8.0):
+
+        def meeting(x: Any, y: Any, z: Any, width: float = width) -> Any:
+            return [-speed * np.clip((x - 20.5) / (0.5 * width), -1.0, 1.0), 0.0 * y + 1.0, 0.0 * z]
+
+        trapped = emission_at(dimension, full, meeting, points, reach)[0]
+        assert step * trapped.sum() == pytest.approx(expected, rel=0.01)
 
 
 def test_directions_are_a_design() -> None:
