@@ -330,9 +330,9 @@ class Whitewater:
         surplus = max(int(ranks.sum(particles.count)) - self.settings.max_particles, 0)
         self.removed = surplus + int(ranks.sum(self._skipped))
         if surplus:
-            arrays = {name: array.numpy() for name, array in particles.arrays().items()}
+            state, position = (particles.arrays()[name].numpy() for name in ("kept", "position"))
             marks = np.zeros(particles.count, dtype=np.int32)
-            marks[oldest(arrays["kept"], arrays["position"], surplus, ranks)] = 1
+            marks[oldest(state, position, surplus, ranks)] = 1
             if particles.count:
                 particles.marks.assign(marks)
                 particles.remove(particles.marks)
