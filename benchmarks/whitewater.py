@@ -157,7 +157,7 @@ def main(words: Sequence[str]) -> None:
             "| cells | particles, mean | most | step without [ms] | with / without | equal bits |\n"
             "|---|---|---|---|---|---|\n"
         )
-        for rate in (None, 2e8, 6.5e8):
+        for rate in (None, 3.7e7, 1.25e8):
             write_cost(CELLS, rate)
 
 
