@@ -86,11 +86,11 @@ class EmissionSettings:
     """Numbers of the emission in a step.
 
     A cell is sampled with the probability `share`, and stands for a cube of side `spread` [cells].
-    It draws at most `most` particles in a step, of which the fraction `youngest` is written, rounded
-    up to a particle. `reach` is the distance of compared points [cells]
-    in `directions`, `count` of them. `trapped` and `crest` are particles of a full potential per
-    sampled cell in the step, by volume and by area. The potentials rise over `trapped_air_range`
-    [m/s], `crest_range` (dimensionless) and `energy_range` [m^2/s^2].
+    It draws at most `most` particles in a step, and writes the fraction `youngest` of them, rounded
+    up. `reach` is the distance of compared points [cells] in `directions`, `count` of them.
+    `trapped` and `crest` are particles of a full potential per sampled cell in the step, by volume
+    and by area. The potentials rise over `trapped_air_range` [m/s], `crest_range` (dimensionless)
+    and `energy_range` [m^2/s^2].
     """
 
     seed: int

@@ -24,8 +24,8 @@ SPEEDS = {"trapped_air": (0.0, 1.5), "speed": (1.0, 3.0)}
 # of crests.
 TRAPPED_AIR_RATE, CREST_RATE = {2: 4e3, 3: 1.2e4}, {2: 1e3, 3: 6e3}
 
-# Mean of Phi_k Phi_ta over the liquid and a run, crests counted as trapped air: 0.7 and 1.2 % in the
-# 3-D scenes of `benchmarks.whitewater`, 1.4 and 1.6 % in its 2-D ones.
+# Mean of Phi_k Phi_ta over the liquid and a run, crests counted as trapped air: 0.7 and 1.2 % in
+# the 3-D scenes of `benchmarks.whitewater`, 1.4 and 1.6 % in its 2-D ones.
 MEAN_POTENTIAL = 0.01
 
 

@@ -251,9 +251,7 @@ class WholeCells:
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
         clear(self._stopped.array)
-        advect(
-            self.grid, fields, self.room, self._dt, position, self._stopped.array, self._endless
-        )
+        advect(self.grid, fields, self.room, self._dt, position, self._stopped.array, self._endless)
 
     def collision_counts(self) -> tuple[int, int, int]:
         """Return the number of particles that met a wall."""
