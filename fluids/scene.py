@@ -390,7 +390,7 @@ class LiquidScene(ParticleScene):
 
     @property
     def resolved_whitewater(self) -> WhitewaterSettings | None:
-        """Return the settings of whitewater with values for all defaults; None if there is none."""
+        """Return the settings of whitewater, defaults included; None without it."""
         if self.whitewater is None or not self.has_whitewater:
             return None
         return self.whitewater.resolved(
@@ -402,7 +402,7 @@ class LiquidScene(ParticleScene):
 
     @property
     def whitewater_estimate(self) -> int:
-        """Return the estimated mean number of particles of spray, foam and bubbles in a run."""
+        """Return the estimated mean number of particles of whitewater in a run."""
         settings = self.resolved_whitewater
         if settings is None:
             return 0

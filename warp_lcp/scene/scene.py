@@ -401,7 +401,7 @@ class Scene(Table):
 
     @property
     def whitewater_estimate(self) -> int:
-        """Return the estimated mean number of particles of spray, foam and bubbles in a run."""
+        """Return the estimated mean number of particles of whitewater in a run."""
         return 0
 
     @property
