@@ -117,6 +117,8 @@ def offers(simulator: str, dimension: int) -> dict[str, ModelScenes]:
         "narrow band": ModelScenes(
             level_set | {"particles": {"narrow_band": {"width": 4.0}}}, level_set
         ),
+        # With the default rates; its own particles are not counted as the liquid's.
+        "whitewater": ModelScenes(level_set | {"whitewater": {}}, level_set),
         "FLIP": ModelScenes(
             {"particles": {"transfer": "flip"}}, {"particles": {"transfer": "pic"}}, unit="particle"
         ),

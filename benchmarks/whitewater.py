@@ -40,7 +40,16 @@ FLAT: dict[str, tuple[list[Tables], float, float]] = {
         0.1,
     ),
 }
-ROOM = [box([0.0, 0.0, 0.0], [0.4, 0.6, 0.4]), box([0.4, 0.0, 0.0], [1.6, 0.1, 0.4])]
+ROOM = {
+    "dam break, 3-D": [
+        box([0.0, 0.0, 0.0], [0.4, 0.6, 0.4]),
+        box([0.4, 0.0, 0.0], [1.6, 0.1, 0.4]),
+    ],
+    "block into a pool, 3-D": [
+        box([0.0, 0.0, 0.0], [1.6, 0.2, 0.4]),
+        box([0.5, 0.4, 0.0], [0.9, 0.75, 0.4], velocity=[0.5, -2.0, 0.0]),
+    ],
+}
 
 
 def create(
@@ -141,13 +150,14 @@ def main(words: Sequence[str]) -> None:
         for name, (liquid, duration, begin) in FLAT.items():
             write_amounts(name, liquid, [1.6, 0.8], duration, begin)
     if "room" in words:
-        write_amounts("dam break, 3-D", ROOM, [1.6, 0.8, 0.4], 1.2, 0.3)
+        for name, liquid in ROOM.items():
+            write_amounts(name, liquid, [1.6, 0.8, 0.4], 1.2, 0.3)
     if "cost" in words:
         sys.stdout.write(
             "| cells | particles, mean | most | step without [ms] | with / without | equal bits |\n"
             "|---|---|---|---|---|---|\n"
         )
-        for rate in (None, 2e8):
+        for rate in (None, 3.7e7, 1.25e8):
             write_cost(CELLS, rate)
 
 

@@ -127,14 +127,9 @@ def whitewater_reach(scene: LiquidScene) -> tuple[str, float] | None:
 
     None without whitewater.
     """
-    if scene.whitewater is None or not scene.has_whitewater:
+    settings = scene.resolved_whitewater
+    if settings is None:
         return None
-    settings = scene.whitewater.resolved(
-        longest=None if scene.domain.boundless else max(scene.domain.size),
-        spacing=scene.spacing,
-        gravity=scene.physics.gravity,
-        dimension=scene.dimension,
-    )
     assert settings.length is not None
     return "whitewater.length", settings.length
 

@@ -377,6 +377,29 @@ class LiquidScene(ParticleScene):
         return self.whitewater is not None and not self.stays_full
 
     @property
+    def resolved_whitewater(self) -> WhitewaterSettings | None:
+        """Return the settings of whitewater, defaults included; None without it."""
+        if self.whitewater is None or not self.has_whitewater:
+            return None
+        return self.whitewater.resolved(
+            longest=None if self.domain.boundless else max(self.domain.size),
+            spacing=self.spacing,
+            gravity=self.physics.gravity,
+            dimension=self.dimension,
+        )
+
+    @property
+    def whitewater_estimate(self) -> int:
+        """Return the estimated mean number of particles of whitewater in a run."""
+        settings = self.resolved_whitewater
+        if settings is None:
+            return 0
+        volume = self.particle_estimate() * (self.spacing / self.particles.per_axis) ** (
+            self.dimension
+        )
+        return settings.expected_count(volume, self.time.duration)
+
+    @property
     def drags(self) -> list[float] | None:
         """Return c_f of the domain's walls and of each solid; None without wall drag.
 

@@ -20,7 +20,7 @@ import warp as wp
 
 from warp_lcp.fluids import whitewater_kernels as kernels
 from warp_lcp.grid.cell_kernel import launch_list, scan
-from warp_lcp.grid.grid_part import ParticleExchange, subdomain_of
+from warp_lcp.grid.grid_part import ParticleExchange, SerialCommunicator, subdomain_of
 from warp_lcp.grid.particle_loops import MARGIN, PARTICLE
 from warp_lcp.grid.particles import Particles
 from warp_lcp.grid.staggered import StaggeredGrid, Window
@@ -28,10 +28,11 @@ from warp_lcp.kernels.launch_graph import clear
 from warp_lcp.kernels.readback import DeviceScalar
 from warp_lcp.material.boundary import Boundary
 from warp_lcp.material.particle_log import Row
-from warp_lcp.material.particle_pieces import PASSIVE, Piece
+from warp_lcp.material.particle_pieces import PASSIVE, Piece, passive_arrays
 from warp_lcp.simulation import Points
 
 if TYPE_CHECKING:
+    from warp_lcp.distributed.ranks import Ranks
     from warp_lcp.fluids.scene import LiquidScene
     from warp_lcp.fluids.simulator import LiquidSimulation
 
@@ -65,6 +66,35 @@ def directions(dimension: int) -> np.ndarray:
     return (np.array(corners) / np.hypot(1.0, golden)).astype(np.float32)
 
 
+def oldest(
+    state: np.ndarray, position: np.ndarray, count: int, ranks: SerialCommunicator | Ranks
+) -> np.ndarray:
+    """Return which particles of this process are among the oldest of all; collective.
+
+    Of equal ages those with the least life come first, then those with the least position. These
+    numbers are particles' own, so that the choice does not depend on their order or process.
+
+    Args:
+        state: age, life [s] and kind, shape (n, 3).
+        position: [m], shape (n, 3).
+        count: number of the oldest particles, at most that of all processes.
+        ranks: the communicator of the processes.
+
+    Returns:
+        Indices in [0, n).
+    """
+    age, own = state[:, 0], np.arange(len(state))
+    if count < len(age):  # the own oldest, with all of the last one's age
+        own = np.flatnonzero(age >= -np.partition(-age, count - 1)[count - 1])
+    keys = np.column_stack([-age[own], state[own, 1], position[own]])
+    everyone = ranks.collect(keys)
+    rank = np.repeat(np.arange(len(everyone)), [len(rows) for rows in everyone])
+    index = np.concatenate([np.arange(len(rows)) for rows in everyone])
+    first = np.lexsort(np.concatenate(everyone).T[::-1])[:count]
+    chosen: np.ndarray = own[index[first[rank[first] == ranks.rank]]]
+    return chosen
+
+
 class Whitewater:
     """Diffuse particles of a liquid, and their emission.
 
@@ -85,14 +115,9 @@ class Whitewater:
     columns = COLUMNS
 
     def __init__(self, scene: LiquidScene, grid: StaggeredGrid) -> None:
-        settings = scene.whitewater
+        settings = scene.resolved_whitewater
         assert settings is not None, "the scene has whitewater"
-        self.settings = settings.resolved(
-            longest=None if scene.domain.boundless else max(scene.domain.size),
-            spacing=grid.spacing,
-            gravity=scene.physics.gravity,
-            dimension=grid.dimension,
-        )
+        self.settings, self._solids = settings, bool(scene.solid)
         nothing = np.zeros((0, 3), dtype=np.float32)
         self.particles = Particles(
             grid, nothing, nothing, affine=False, kept=nothing[:, 0], indexed=False
@@ -174,28 +199,16 @@ class Whitewater:
         """Continue from the arrays of `state`.
 
         Raises:
-            ValueError: they are missing, or not float32 of one shape (n, 3), or not finite.
+            ValueError: as of `passive_arrays`.
         """
-        missing = sorted(STATE.keys() - state.keys())
-        if missing:
-            raise ValueError(
-                f"the state lacks {', '.join(missing)}: it does not belong to this scene"
-            )
-        arrays = {own: np.asarray(state[name]) for name, own in STATE.items()}
-        shape = (len(arrays["position"]), 3)
-        for name, array in arrays.items():
-            if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
-                raise ValueError(
-                    f"the state's whitewater has a {name} of {array.dtype}{array.shape}: expected "
-                    f"finite float32{shape}"
-                )
-        self.particles.assign(arrays)
+        arrays = passive_arrays(state)
+        self.particles.assign({own: arrays[name] for name, own in STATE.items()})
 
     def restore_pieces(self, pieces: Sequence[Piece]) -> None:
         """Continue from the particles of all ranks' pieces in this rank's box; collective.
 
         Raises:
-            ValueError: as of `restore`; on all ranks.
+            ValueError: as of `passive_arrays`; on all ranks.
         """
         found = subdomain_of(self.grid).rows_of_pieces(pieces, list(STATE))
         self.particles.assign({own: found[name] for name, own in STATE.items()})
@@ -212,10 +225,14 @@ class Whitewater:
         components = [velocity[0], velocity[1], velocity[-1]]
         window.launch(kernels.center_kernel, [grid.planes, *components, phi, self._centers])
         fields.planes, fields.dx = grid.planes, grid.spacing
-        fields.cut, fields.origin = int(boundary.distance is not None), wp.vec3i(*grid.origin)
+        fields.origin = wp.vec3i(*grid.origin)
         fields.low, fields.high = (wp.vec3(*corner) for corner in self._limits(boundary))
         fields.centers, fields.base = self._centers, boundary.base
+        # Arrays that the kernels do not read with these walls are others of their type.
         fields.distance = phi if boundary.distance is None else boundary.distance
+        fields.room = boundary.base if boundary.room is None else boundary.room
+        whole = kernels.CELLS if self._solids else kernels.NONE
+        fields.walls = kernels.CUT if boundary.room is None else whole
         return fields
 
     def _limits(self, boundary: Boundary) -> tuple[list[float], list[float]]:
@@ -258,28 +275,39 @@ class Whitewater:
         numbers.crest_range = wp.vec2(*settings.crest)
         numbers.energy_range = wp.vec2(*(0.5 * speed**2 for speed in settings.speed))
         numbers.layer, numbers.lifetime = self.layer / grid.spacing, settings.lifetime
-        numbers.dt = dt
+        numbers.dt, numbers.youngest = dt, 1.0
         return numbers
 
     def _emit(self, fields: kernels.LiquidFields, window: Window, step: int, dt: float) -> None:
-        """Add the new particles of a step, in the order of cells; of too many the last ones."""
-        self._skipped = 0
+        """Add the new particles of a step, in the order of cells; collective.
+
+        If there are more than `max_particles` on all ranks, each cell writes only the youngest of
+        its own: others would be removed at the end of the step.
+        """
         own = self.grid.part.near(window, 0)  # other ranks emit in their own cells
+        numbers, most = self._emission(step, dt), self.settings.max_particles
+        drawn = written = self._count(own, fields, numbers)
+        everyone = int(self.grid.part.ranks.sum(drawn))
+        if everyone > most:
+            numbers.youngest = most / everyone
+            written = self._count(own, fields, numbers)
+        self._skipped = drawn - written
+        if own is not None and written:
+            old = self.particles.make_room(written)
+            inputs = [fields, numbers, self._ends, old, *self.particles.arrays().values()]
+            own.launch(kernels.emit_kernel, inputs)
+
+    def _count(
+        self, own: Window | None, fields: kernels.LiquidFields, numbers: kernels.EmissionSettings
+    ) -> int:
+        """Sum up the cells' numbers of new particles in `_ends`; return the last sum."""
         if own is None:
-            return
-        numbers, ends = self._emission(step, dt), self._ends
-        clear(ends)
-        own.launch(kernels.count_kernel, [fields, numbers, ends])
-        flat = ends.flatten()
+            return 0
+        clear(self._ends)
+        own.launch(kernels.count_kernel, [fields, numbers, self._ends])
+        flat = self._ends.flatten()
         scan(flat, flat, inclusive=True)
-        new = int(flat[-1:].numpy()[0])
-        if new == 0:
-            return
-        # More would all be removed at the end of the step.
-        self._skipped = max(new - self.settings.max_particles, 0)
-        old = self.particles.make_room(new - self._skipped)
-        inputs = [fields, numbers, ends, self._skipped, old, *self.particles.arrays().values()]
-        own.launch(kernels.emit_kernel, inputs)
+        return int(flat[-1:].numpy()[0])
 
     def _move(self, fields: kernels.LiquidFields, gravity: np.ndarray, dt: float) -> None:
         """Launch the motion of the particles, and the removal of those that it marks."""
@@ -297,35 +325,17 @@ class Whitewater:
         particles.launch_removal(particles.marks)
 
     def _limit(self) -> None:
-        """Remove the oldest particles if there are more than `max_particles`."""
-        particles, part = self.particles, self.grid.part
-        surplus = max(int(part.ranks.sum(particles.count)) - self.settings.max_particles, 0)
-        self.removed = surplus + int(part.ranks.sum(self._skipped))
-        if surplus and part.shared:
-            self._remove_oldest(surplus)
-        elif surplus:
-            launch_list(
-                kernels.mark_first_kernel,
-                particles.count,
-                [surplus, particles.marks],
-                device=self.grid.device,
-            )
-            particles.remove(particles.marks)
-
-    def _remove_oldest(self, surplus: int) -> None:
-        """Remove the `surplus` oldest particles of all ranks; collective.
-
-        After migrations the particles are in no order of age.
-        """
-        particles = self.particles
-        ages = particles.arrays()["kept"].numpy()[:, 0]
-        order = np.argsort(-ages, kind="stable")[:surplus]
-        own = subdomain_of(self.grid).count_of_oldest(ages[order], surplus)
-        if own:
+        """Remove the oldest particles if there are more than `max_particles`; collective."""
+        particles, ranks = self.particles, self.grid.part.ranks
+        surplus = max(int(ranks.sum(particles.count)) - self.settings.max_particles, 0)
+        self.removed = surplus + int(ranks.sum(self._skipped))
+        if surplus:
+            state, position = (particles.arrays()[name].numpy() for name in ("kept", "position"))
             marks = np.zeros(particles.count, dtype=np.int32)
-            marks[order[:own]] = 1
-            particles.marks.assign(marks)
-            particles.remove(particles.marks)
+            marks[oldest(state, position, surplus, ranks)] = 1
+            if particles.count:
+                particles.marks.assign(marks)
+                particles.remove(particles.marks)
 
     def _row(self) -> Row:
         """Return the values of `COLUMNS`, summed over ranks; collective."""

@@ -9,11 +9,11 @@ from liquids_on_ranks import advance
 from ranks_in_turn import RankInTurn, on_ranks
 from scipy.spatial import cKDTree
 from test_shared_particles import cells_of, part_of, scattered
-from whitewater_on_ranks import CASES, HALF, MOST, STEPS, foaming, gathered
+from whitewater_on_ranks import CASES, HALF, MOST, SPLASH, STEPS, foaming, gathered
 
 from warp_lcp.distributed.ranks import Ranks
-from warp_lcp.fluids import SIMULATOR
-from warp_lcp.fluids.whitewater import COLUMNS, STATE
+from warp_lcp.fluids import SIMULATOR, LiquidScene
+from warp_lcp.fluids.whitewater import COLUMNS, STATE, oldest
 
 PROGRAM = Path(whitewater_on_ranks.__file__)
 TESTS = Path(__file__).parents[1]
@@ -63,14 +63,13 @@ def test_numbers_are_those_of_one_process(folder, name, ranks):
     )
     rows = np.column_stack([found[array] for array in STATE])
     assert len(np.unique(rows, axis=0)) == len(rows), "particles are doubled"
-    if name != "few":
-        # Position and age, where 1 s counts as 1 m.
-        both = [
-            np.column_stack([of["whitewater_position"], of["whitewater_state"][:, 0]])
-            for of in (found, alone(simulation))
-        ]
-        assert (cKDTree(both[0]).query(both[1])[0] < 1e-3).mean() > 0.95
-    else:  # among those of one step, one process removes the first cells', ranks the oldest
+    # Position and age, where 1 s counts as 1 m.
+    both = [
+        np.column_stack([of["whitewater_position"], of["whitewater_state"][:, 0]])
+        for of in (found, alone(simulation))
+    ]
+    assert (cKDTree(both[0]).query(both[1])[0] < 1e-3).mean() > 0.95
+    if name == "few":
         assert own == MOST
         assert found["logs"][:, 3].sum() == pytest.approx(log[:, 3].sum(), rel=0.02)
 
@@ -145,6 +144,21 @@ def test_a_length_beyond_the_boxes_is_refused_with_the_longest():
     }
 
 
+def test_an_unbounded_domain_is_refused():
+    """Ranks share a whole domain; no grid of theirs follows the liquid."""
+    tables = {"domain": {"spacing": 0.025, "dimension": 2}, "liquid": SPLASH["liquid"]}
+    unbounded = LiquidScene.model_validate(
+        {"scene": {"simulator": "fluids"}, "time": {"duration": 1.0}, "whitewater": {}} | tables
+    )
+
+    def work(seat: RankInTurn) -> str:
+        with pytest.raises(ValueError, match=r"domain\.spacing, an unbounded domain") as error:
+            SIMULATOR.create(unbounded, device="cpu", folder=Path(), ranks=Ranks(seat))
+        return str(error.value)
+
+    assert all("give domain.size and domain.resolution" in words for words in on_ranks(2, work))
+
+
 @pytest.mark.parametrize(("counts", "size"), [((24, 12, 1), 2), ((12, 12, 12), 8)])
 def test_particles_go_to_the_rank_of_their_cell_once(counts, size):
     """From any rank to any other one, also across several boxes; the oldest are found exactly."""
@@ -161,9 +175,8 @@ def test_particles_go_to_the_rank_of_their_cell_once(counts, size):
         for name, values in arrays.items():
             np.testing.assert_array_equal(found[name], values[rows])
         assert part.send_to_owners(found) is None
-        oldest = np.sort(found["kept"][:, 0])[::-1]
-        count = part.count_of_oldest(oldest, 37)
-        assert (oldest[:count] >= 463).all()
+        count = len(removed := oldest(found["kept"], found["position"], 37, part.ranks))
+        assert (found["kept"][removed, 0] >= 463).all()
         return rows, count
 
     results = on_ranks(size, work)

@@ -18,8 +18,9 @@ from small_runs import StepCounter, run_into, written_files
 from warp_lcp.extras.export import export_run
 from warp_lcp.fluids import LiquidScene
 from warp_lcp.fluids import whitewater_kernels as kernels
-from warp_lcp.fluids.whitewater import COLUMNS, KINDS, STATE, directions
+from warp_lcp.fluids.whitewater import COLUMNS, KINDS, STATE, directions, oldest
 from warp_lcp.fluids.whitewater_table import WhitewaterSettings
+from warp_lcp.grid.grid_part import ONE_PROCESS
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.kernels.compiler import forward_kernel
 from warp_lcp.render.recording import Recording
@@ -144,7 +145,7 @@ def test_a_state_without_whitewater_or_with_a_wrong_one_is_refused() -> None:
     with pytest.raises(ValueError, match="lacks whitewater_position"):
         splash().restore({name: a for name, a in state.items() if name not in STATE})
     bad = state | {"whitewater_velocity": np.zeros((7, 3), dtype=np.float32)}
-    with pytest.raises(ValueError, match="whitewater has a velocity of"):
+    with pytest.raises(ValueError, match="whitewater_velocity is float32"):
         splash().restore(bad)
 
 
@@ -169,6 +170,21 @@ def test_spray_flies_along_its_parabola() -> None:
     height = 0.4 + 0.5 * 0.1 - 9.81 * 0.01**2 * 55  # symplectic Euler: n (n + 1) / 2 kicks
     np.testing.assert_allclose(now["whitewater_position"][0], [0.4, height, 0.0], atol=1e-5)
     assert now["whitewater_state"][0, 2] == SPRAY
+
+
+def test_a_new_particle_goes_with_the_liquid_before_its_birth() -> None:
+    """It moves for the whole step, and falls for the rest of it."""
+    simulation = create(scene(size=[1.0, 0.5], resolution=24, liquid=FALLING[2][:1], **QUIET))
+    put(simulation, [[0.3, 0.4, 0.0]], [[1.0, 0.5, 0.0]])
+    state = arrays_of(simulation)
+    state["whitewater_state"][0, 0] = -0.0025
+    simulation.whitewater.restore(state)
+    stepped(simulation, 1)
+    now, fall = arrays_of(simulation), 9.81 * 0.0075
+    np.testing.assert_allclose(now["whitewater_velocity"][0], [1.0, 0.5 - fall, 0.0], atol=1e-5)
+    height = 0.4 + 0.01 * (0.5 - fall)
+    np.testing.assert_allclose(now["whitewater_position"][0], [0.31, height, 0.0], atol=1e-5)
+    assert now["whitewater_state"][0, 0] == pytest.approx(0.0075)
 
 
 def test_a_bubble_rises_at_its_speed_and_becomes_foam() -> None:
@@ -241,6 +257,19 @@ def test_the_oldest_go_if_there_are_too_many() -> None:
     assert (np.diff(ages) <= 0.011).all()  # the first are the oldest, up to a step
 
 
+def test_of_equal_ages_those_with_the_least_life_go_first() -> None:
+    """The choice does not depend on the order of the particles."""
+    rng = np.random.default_rng(8)
+    age, life = rng.integers(0, 4, 60), rng.permutation(60)
+    state = np.column_stack([age, life, age]).astype(np.float32)
+    position = rng.random((60, 3)).astype(np.float32)
+    for count in (1, 17, 59, 60):
+        expected = np.lexsort([life, -age])[:count]
+        for order in (np.arange(60), rng.permutation(60)):
+            found = order[oldest(state[order], position[order], count, ONE_PROCESS)]
+            np.testing.assert_array_equal(np.sort(found), np.sort(expected))
+
+
 def test_huge_rates_take_no_more_memory_than_the_largest_number() -> None:
     def first_emission(rate: float, most: int) -> Any:
         """Return a splash after its first step that emits particles."""
@@ -254,8 +283,9 @@ def test_huge_rates_take_no_more_memory_than_the_largest_number() -> None:
     limited, removed = first_emission(1e7, 40)
     assert none == 0
     assert removed == every.whitewater.particles.count - 40
+    youngest = np.sort(np.argsort(arrays_of(every)["whitewater_state"][:, 0], kind="stable")[:40])
     for name, array in arrays_of(limited).items():
-        np.testing.assert_array_equal(array, arrays_of(every)[name][-40:])
+        np.testing.assert_array_equal(array, arrays_of(every)[name][youngest])
     # More than integers of 32 bits can count.
     huge, removed = first_emission(1e17, 40)
     assert huge.whitewater.particles.count == 40
@@ -464,6 +494,29 @@ def test_approach_of_liquid(dimension: int) -> None:
     )
     for flow in (turning, spreading):
         assert emission_at(dimension, full, flow, at, reach)[0][0] == pytest.approx(0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_the_approach_of_two_streams_does_not_depend_on_the_width_of_their_front(
+    dimension: int,
+) -> None:
+    """Its integral across the front is 4 U R mean(r_x^2), however far cells spread the front."""
+    speed, reach, step = 0.5, 4.0, 0.25
+    x = np.arange(8.0, 33.0, step)
+    points = np.column_stack([x, 0.0 * x + 20.5, 0.0 * x + (20.5 if dimension == 3 else 1.5)])
+    r = directions(dimension).astype(np.float64)
+    expected = 4.0 * speed * reach * (r[:, 0] ** 2).mean()
+
+    def full(x: Any, y: Any, z: Any) -> Any:
+        return 0.0 * x - 3.0
+
+    for width in (2.0, 4.0, 8.0):
+
+        def meeting(x: Any, y: Any, z: Any, width: float = width) -> Any:
+            return [-speed * np.clip((x - 20.5) / (0.5 * width), -1.0, 1.0), 0.0 * y + 1.0, 0.0 * z]
+
+        trapped = emission_at(dimension, full, meeting, points, reach)[0]
+        assert step * trapped.sum() == pytest.approx(expected, rel=0.01)
 
 
 def test_directions_are_a_design() -> None:

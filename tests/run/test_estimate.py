@@ -9,6 +9,7 @@ from default_run import slow
 from small_runs import run_into
 from warp_lcp.cli.commands import app
 from warp_lcp.grid.triangle_mesh import builtin_mesh
+from warp_lcp.render.recording import Recording
 from warp_lcp.run.check import start
 from warp_lcp.run.estimate import (
     doubts,
@@ -49,6 +50,26 @@ def test_steps_and_bytes_are_those_of_the_run(name: str, tmp_path: Path) -> None
     record = run_into(scene, tmp_path / "run")
     taken = sum(file.stat().st_size for file in (tmp_path / "run").rglob("*") if file.is_file())
     assert 1 / FACTOR < steps / record.steps < FACTOR
+    assert 1 / FACTOR < size / taken < FACTOR
+
+
+def test_whitewater_counts_in_bytes_and_words(tmp_path: Path) -> None:
+    """Its mean number is that of the run within a factor of two; `max_particles` bounds it."""
+    keys = ["domain.resolution=48", "time.duration=1.5", "whitewater.lifetime=1.0"]
+    scene = load_scene("dam-break-2d", keys)
+    simulation = start(scene, "cpu")
+    size = expected_bytes(scene, simulation, expected_steps(scene, simulation))
+    bare = load_scene("dam-break-2d", keys[:2])
+    assert size > 1.05 * expected_bytes(bare, start(bare, "cpu"), 0)
+    assert "particles of whitewater" in dict(estimate_run(scene, simulation))["disk"]
+    few = load_scene("dam-break-2d", [*keys, "whitewater.max_particles=10"])
+    assert few.whitewater_estimate == 10
+    folder = tmp_path / "run"
+    run_into(scene, folder)
+    files = list((folder / "frames").glob("whitewater_*.vtu"))
+    mean = sum(len(Recording(folder).whitewater(n).points) for n in range(len(files))) / len(files)
+    assert 0.5 < scene.whitewater_estimate / mean < 2.0
+    taken = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     assert 1 / FACTOR < size / taken < FACTOR
 
 

@@ -40,6 +40,12 @@ def check_shared(
     """
     ranks.agree("the scene", scene.model_dump(mode="json"))
     errors = [f"{key} {NOT_ON_RANKS}" for key in refused]
+    if scene.domain.boundless:
+        # Ranks share the whole domain: no grid follows the material.
+        errors.append(
+            "domain.spacing, an unbounded domain, works on one process only (without --engine "
+            "petsc): give domain.size and domain.resolution"
+        )
     if scene.solver.method not in methods:
         errors.append(
             f"solver.method = {scene.solver.method} works on one process only (without --engine "

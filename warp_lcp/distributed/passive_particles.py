@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_lcp.distributed.particle_pieces import cells_of
-from warp_lcp.material.particle_pieces import Piece
+from warp_lcp.material.particle_pieces import Piece, passive_arrays
 
 if TYPE_CHECKING:
     from warp_lcp.distributed.subdomain import Subdomain
@@ -65,41 +65,13 @@ def rows_of_pieces(
         names: of arrays, float32 of shape (n, 3); the first one has the positions [m].
 
     Raises:
-        ValueError: a piece lacks an array, or its arrays do not fit together; on all ranks.
+        ValueError: as of `passive_arrays`; on all ranks.
     """
     with part.decomposition.collective.root_only():
         found: dict[str, list[np.ndarray]] = {name: [] for name in names}
         for piece in pieces:
-            missing = [name for name in names if name not in piece]
-            if missing:
-                raise ValueError(
-                    f"the state lacks {', '.join(missing)}: it does not belong to this scene"
-                )
-            arrays = {name: np.asarray(piece[name]) for name in names}
-            shape = (len(arrays[names[0]]), 3)
-            for name, values in arrays.items():
-                if values.shape != shape or values.dtype != np.float32:
-                    raise ValueError(
-                        f"the state's {name} is {values.dtype}{values.shape}: expected "
-                        f"float32{shape}"
-                    )
-                if not np.isfinite(values).all():
-                    raise ValueError(f"the state's {name} has values that are not finite")
+            arrays = passive_arrays(piece, names)
             inside = part.owners(cells_of(part, arrays[names[0]])) == part.ranks.rank
             for name, values in arrays.items():
                 found[name].append(values[inside])
         return {name: np.concatenate(values) for name, values in found.items()}
-
-
-def count_of_oldest(part: Subdomain, ages: np.ndarray, count: int) -> int:
-    """Return how many of the oldest particles of all ranks are this rank's; collective.
-
-    Args:
-        part: the subdomain of this rank.
-        ages: of this rank's oldest particles [s], the largest first; `count` suffice.
-        count: how many of all ranks' particles are wanted.
-    """
-    everyone = part.ranks.collect(ages[:count])
-    rank = np.repeat(np.arange(len(everyone)), [len(values) for values in everyone])
-    oldest = np.argsort(-np.concatenate(everyone), kind="stable")[:count]
-    return int(np.count_nonzero(rank[oldest] == part.ranks.rank))

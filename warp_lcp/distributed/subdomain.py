@@ -19,7 +19,7 @@ from warp_lcp.distributed.interruptible_wait import waiting
 from warp_lcp.distributed.messages import Mailbox, MpiMailbox, exchange_all, exchange_all_operation
 from warp_lcp.distributed.particle_pieces import take_pieces
 from warp_lcp.distributed.particles import ParticleMigration
-from warp_lcp.distributed.passive_particles import count_of_oldest, rows_of_pieces, send_to_owners
+from warp_lcp.distributed.passive_particles import rows_of_pieces, send_to_owners
 from warp_lcp.distributed.ranks import Ranks
 from warp_lcp.distributed.repartition import cuts_of, migrate
 from warp_lcp.distributed.subdomain_boundary import boundary_of_part
@@ -291,7 +291,7 @@ class Subdomain(GridPart):
     def send_to_owners(self, arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
         """Send passive particles to the ranks of their cells; collective.
 
-        See `warp_lcp.distributed.passive_particles`, also for the next two methods.
+        See `warp_lcp.distributed.passive_particles`, also for the next method.
         """
         return send_to_owners(self, arrays)
 
@@ -300,10 +300,6 @@ class Subdomain(GridPart):
     ) -> dict[str, np.ndarray]:
         """Return the passive particles of pieces that lie in this box; collective."""
         return rows_of_pieces(self, pieces, names)
-
-    def count_of_oldest(self, ages: np.ndarray, count: int) -> int:
-        """Return how many of all ranks' oldest particles are this rank's; collective."""
-        return count_of_oldest(self, ages, count)
 
     @property
     def corners(self) -> tuple[Corner, Corner]:

@@ -55,6 +55,7 @@ class Boundary(Protocol):
         capacity: float32 open fraction of a cell's quadratic kernel.
         distance: float32 distance to the solids at the cells' low corners [cells]; None for whole
             cells.
+        room: int8 number of cells to the nearest SOLID one, see `clearance`; None for cut cells.
         kinks: times [s] at which the velocity of a solid jumps.
         thin: solids that particles meet as exact shapes; None if none is thin.
     """
@@ -69,6 +70,7 @@ class Boundary(Protocol):
     velocity: Faces
     capacity: wp.array | None
     distance: wp.array | None
+    room: wp.array | None
     kinks: tuple[float, ...]
 
     def top_speed(self, time: float, span: float) -> float:
@@ -200,7 +202,7 @@ class WholeCells:
             walls += [None, wp.vec3()]
             for axis, field in enumerate(self.velocity):
                 grid.everywhere.launch(kernels.wall_velocity_kernel, [axis, *walls, field])
-        self._room = clearance(grid, self.base)
+        self.room = clearance(grid, self.base)
         self._stopped, self._dt = DeviceScalar(grid.device, dtype=wp.int32), Scalar()
         self._advection = LaunchGraph(grid.device, self._advect)
         self._displacement = LaunchGraph(grid.device, self._displace)
@@ -243,7 +245,7 @@ class WholeCells:
 
     def placed(self) -> list[wp.array]:
         """Return the fields of the solids."""
-        return [self.base, self.touch, self.capacity, self._room]
+        return [self.base, self.touch, self.capacity, self.room]
 
     def advect(self, fields: Faces, dt: float, time: float, position: wp.array) -> None:
         """Advect particles, never into a SOLID cell."""
@@ -253,9 +255,7 @@ class WholeCells:
 
     def _advect(self, fields: Faces, position: wp.array) -> None:
         clear(self._stopped.array)
-        advect(
-            self.grid, fields, self._room, self._dt, position, self._stopped.array, self._endless
-        )
+        advect(self.grid, fields, self.room, self._dt, position, self._stopped.array, self._endless)
 
     def collision_counts(self) -> tuple[int, int, int]:
         """Return the number of particles that met a wall."""
@@ -266,7 +266,7 @@ class WholeCells:
         self._displacement.run(fields, position)
 
     def _displace(self, fields: Faces, position: wp.array) -> None:
-        advect(self.grid, fields, self._room, 1.0, position, self._stopped.array, self._endless)
+        advect(self.grid, fields, self.room, 1.0, position, self._stopped.array, self._endless)
 
     def place(self, time: float) -> None:
         """Do nothing: the solids do not move."""
@@ -304,6 +304,8 @@ class CutBoundary:
     Raises:
         ValueError: solids differ at the two sides of an axis without an end.
     """
+
+    room: wp.array | None = None
 
     def __init__(
         self,

@@ -24,6 +24,33 @@ def fields_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {name: values for name, values in state.items() if np.ndim(values) >= 3}
 
 
+def passive_arrays(
+    state: Mapping[str, np.ndarray], names: Sequence[str] = PASSIVE
+) -> dict[str, np.ndarray]:
+    """Return the arrays of passive particles in a state or a piece, checked.
+
+    Args:
+        state: the arrays by name.
+        names: those of the particles, float32 of shape (n, 3).
+
+    Raises:
+        ValueError: one is missing, or not float32 of the same shape (n, 3), or not finite.
+    """
+    missing = sorted(set(names) - set(state))
+    if missing:
+        raise ValueError(f"the state lacks {', '.join(missing)}: it does not belong to this scene")
+    arrays = {name: np.asarray(state[name]) for name in names}
+    shape = (len(arrays[names[0]]), 3)
+    for name, values in arrays.items():
+        if values.shape != shape or values.dtype != np.float32:
+            raise ValueError(
+                f"the state's {name} is {values.dtype}{values.shape}: expected float32{shape}"
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"the state's {name} has values that are not finite")
+    return arrays
+
+
 def piece_of(state: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return the state of a one-process simulation as the piece of a single rank.
 

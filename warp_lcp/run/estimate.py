@@ -27,6 +27,7 @@ BURIED = 0.5  # fraction of a material's points in solids; less is normal for ma
 LOG_BYTES = 14  # per entry
 FRAME_SECONDS = 3e-3  # per frame, on one core
 BYTE_SECONDS = 2.5e-9  # per byte, on one core
+WHITEWATER_STATE_BYTES = 36  # a particle in a checkpoint: nine numbers
 ROW_SECONDS = 0.8e-3  # per step, besides the simulation: time step and log row
 
 
@@ -48,8 +49,17 @@ def estimate_run(
     else:
         steps = longest_steps(scene, simulation)
     size = expected_bytes(scene, simulation, steps)
+    disk = [("disk", f"about {in_words(size)}")]
+    if scene.whitewater_estimate:
+        disk = [
+            (
+                "disk",
+                f"about {in_words(size)}, with {scene.whitewater_estimate:,} particles of "
+                "whitewater in the mean, as many as dam breaks have",
+            )
+        ]
     if seconds is None:
-        return [("steps", f"about {steps:,}"), ("disk", f"about {in_words(size)}")]
+        return [("steps", f"about {steps:,}"), *disk]
     frames = scene.time.frame_count * FRAME_SECONDS + size * BYTE_SECONDS
     whole = steps * (seconds + ROW_SECONDS) + frames
     lasts = timedelta(seconds=round(whole)) if whole >= 10.0 else f"{whole:.2g} s"
@@ -57,7 +67,7 @@ def estimate_run(
     return [
         ("steps", f"about {steps:,}"),
         *([("whole run", spent)] if seconds > 0.0 else []),
-        ("disk", f"about {in_words(size)}"),
+        *disk,
     ]
 
 
@@ -155,13 +165,29 @@ def expected_bytes(scene: Scene, simulation: Simulation, steps: int) -> int:
     """Return the estimated disk use of a run: frames, checkpoints and log [bytes]."""
     output, wanted = scene.output, {"particles": scene.output.particles, "grid": scene.output.grid}
     growth = expected_growth(scene) if isinstance(scene, ParticleScene) else 1.0
-    frame = [_grown(part, growth) for part in simulation.frame() if wanted.get(part.name, True)]
+    frame = [
+        _blank(part, scene.whitewater_estimate)
+        if isinstance(part, Points) and part.name == "whitewater"
+        else _grown(part, growth)
+        for part in simulation.frame()
+        if wanted.get(part.name, True)
+    ]
     each = frame_bytes(
         frame, output.grid_format, surface_ply=output.surface_ply, frame_format=output.format
     )
     state = sum(array.nbytes for array in simulation.state().values())
+    state += scene.whitewater_estimate * WHITEWATER_STATE_BYTES
     log = steps * LOG_BYTES * (len(simulation.columns()) + 5)
     return round(each * (scene.time.frame_count + 1) + output.checkpoints_kept * state + log)
+
+
+def _blank(part: Points, count: int) -> Points:
+    """Return the points with other numbers of them, all zero."""
+    fields = {
+        name: np.zeros((count, *values.shape[1:]), dtype=values.dtype)
+        for name, values in part.fields.items()
+    }
+    return replace(part, fields=fields, points=np.zeros((count, 3), dtype=part.points.dtype))
 
 
 def _grown(part: Part, factor: float) -> Part:

@@ -400,6 +400,11 @@ class Scene(Table):
         return False
 
     @property
+    def whitewater_estimate(self) -> int:
+        """Return the estimated mean number of particles of whitewater in a run."""
+        return 0
+
+    @property
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and high corner [m] of the region in pictures, shape (3,).
 
