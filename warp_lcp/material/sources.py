@@ -437,7 +437,7 @@ class Sources:
 
 
 def lattice_shear(velocity: np.ndarray, dimension: int) -> tuple[int, np.ndarray]:
-    """Return the axis nearest to a flow, and the shear along it of a lattice without layers.
+    """Shear a lattice so that it has no layers across a flow.
 
     With axis a, the sheared lattice has the points n + e_a (s_b n_b + s_c n_c), n of integers.
     Those that pass a plane across the flow v at one time have the same v p / v_a, which is
@@ -454,7 +454,7 @@ def lattice_shear(velocity: np.ndarray, dimension: int) -> tuple[int, np.ndarray
         dimension: 2 or 3.
 
     Returns:
-        a, and s, shape (3,), 0 along a.
+        a, the axis nearest to the flow, and s, shape (3,), 0 along a.
     """
     along, shear = int(np.argmax(np.abs(velocity))), np.zeros(3)
     across = [axis for axis in range(dimension) if axis != along]

@@ -141,11 +141,11 @@ for (int start = first; start < last; start += M) {
 }
 
 // kernel warp_lcp.grid.surface_mesh.restore: Move a curved surface back by as much as smoothing has
-// moved it. A Gaussian of variance V moves the surface of a ball, with curvature kappa (the sum of
-// both) = 2 / R, inward by V / R = V kappa / 2, up to (spread / R)^4: phi -= V kappa / 2. The
-// curvature kappa = -div(grad f / |grad f|) is that of the contours of the share f, smoothed further
-// so that bumps of the particles are not amplified: contours of a ball or cylinder stay round. Most
-// curvatures below `beads` [1 / lattice cells] are the particles': kappa becomes
+// moved it. A Gaussian of variance V moves the surface of a ball, with curvature kappa = 2 / R (the
+// sum of both), inward by V / R = V kappa / 2, up to terms of (spread / R)^4: phi -= V kappa / 2.
+// The curvature kappa = -div(grad f / |grad f|) is that of the contours of the share f, smoothed
+// further so that bumps of the particles are not amplified: contours of a ball or cylinder stay
+// round. Most curvatures below `beads` [1 / lattice cells] are the particles': kappa becomes
 // kappa^3 / (kappa^2 + beads^2). Sheets are plane, and keep their thickness.
 //   compute    float32
 //   box        float32 phi, thin, wide, capacity?
@@ -172,8 +172,9 @@ for (int i = first; i < last; ++i) {
         slope[a] = 0.5f * (high - low);
         second[a] = high - 2 * middle + low;
         for (int b = 0; b < a; ++b)  // (x, y), (x, z), (y, z) are numbered 0, 1, 2
-            mixed[a + b - 1] = 0.25f * (share(i + step[a] + step[b]) - share(i + step[a] - step[b]) -
-                                        share(i - step[a] + step[b]) + share(i - step[a] - step[b]));
+            mixed[a + b - 1] =
+                0.25f * (share(i + step[a] + step[b]) - share(i + step[a] - step[b]) -
+                         share(i - step[a] + step[b]) + share(i - step[a] - step[b]));
     }
     const float x = slope[0] * slope[0], y = slope[1] * slope[1], z = slope[2] * slope[2],
                 steep = x + y + z;
