@@ -82,6 +82,10 @@ MATERIAL = """## Material, sources and drains
 
 `[[liquid]]` and `[[sand]]` fill their [shape](#shapes) at the start. A `[[source]]` lets material
 in, a `[[drain]]` removes it.
+
+The particles of a source lie on a lattice without layers across the flow, so that a falling sheet
+is stretched evenly. With two particles along a cell's edge its surface has holes where the sheet
+is thinner than about 0.6 cells; use a thicker source or a finer grid.
 """
 
 PLACED = """### Placing a shape

@@ -280,9 +280,13 @@ def test_wrong_input_leaves_no_file(dots, tmp_path, monkeypatch):
     assert sorted(one.name for one in tmp_path.iterdir()) == ["file", "folder.abc", "run"]
 
 
-def test_a_full_disk_is_reported_and_does_not_abort(dots, tmp_path):
+@pytest.mark.parametrize("solids", [0, 40])
+def test_a_full_disk_is_reported_and_does_not_abort(dots, tmp_path, solids):
+    """Disk that is full while frames are added, or already while solids are."""
     resource = pytest.importorskip("resource", reason="limits of files are for POSIX")
-    folder = write_run(tmp_path / "run", frames_of_ball_and_drops(6), size=ROOM)
+    sphere = '[[solid]]\nshape = "sphere"\ncenter = [0.5, 0.5, 0.5]\nradius = {}\n'
+    text = "".join(sphere.format(0.1 + 0.001 * number) for number in range(solids))
+    folder = write_run(tmp_path / "run", frames_of_ball_and_drops(6), text, size=ROOM)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))

@@ -131,11 +131,11 @@ def test_the_header_byte_by_byte(tmp_path):
     assert struct.unpack_from("<3d", grid, 528) == (SPACING / 2,) * 3
     assert struct.unpack_from("<I", grid, 632)[0] == 1
     leaves = struct.unpack_from("<I", grid, 672 + 32)[0]
-    tiles = np.pad(distance(), [(0, -count % 8) for count in SHAPE], constant_values=1.0).reshape(
+    blocks = np.pad(distance(), [(0, -count % 8) for count in SHAPE], constant_values=1.0).reshape(
         3, 8, 3, 8, 4, 8
     )
     # Voxels far outside take no space.
-    assert leaves == np.count_nonzero(tiles.min(axis=(1, 3, 5)) < BAND)
+    assert leaves == np.count_nonzero(blocks.min(axis=(1, 3, 5)) < BAND)
 
 
 def test_cells_far_inside_take_no_room(tinyvdb, tmp_path):
@@ -145,10 +145,10 @@ def test_cells_far_inside_take_no_room(tinyvdb, tmp_path):
     )
     write_nvdb(tmp_path / "a.nvdb", Volume("level_set", values, 1.0, 2.0))
     file = tinyvdb.NanoVDBFile(str(tmp_path / "a.nvdb"))
-    tiles = np.pad(
+    blocks = np.pad(
         np.clip(values, -2, 2), [(0, -count % 8) for count in values.shape], constant_values=2.0
     ).reshape(9, 8, 10, 8, 38, 8)
-    varied = (tiles.min(axis=(1, 3, 5)) < 2.0) & (tiles.max(axis=(1, 3, 5)) > -2.0)
+    varied = (blocks.min(axis=(1, 3, 5)) < 2.0) & (blocks.max(axis=(1, 3, 5)) > -2.0)
     assert file.node_counts(0) == (np.count_nonzero(varied), 2, 1)
     rng = np.random.default_rng(4133)
     for x, y, z in rng.integers(0, [300, 80, 70], (20_000, 3)):

@@ -146,15 +146,15 @@ def test_vectors_byte_by_byte(tmp_path):
     velocity = volumes.volumes[2].values
     padded = np.pad(velocity, [*((0, -count % LEAF) for count in SMALL), (0, 0)])
     nz, ny, nx = (count // LEAF for count in padded.shape[:3])
-    tiles = padded.reshape(nz, LEAF, ny, LEAF, nx, LEAF, 3).transpose(4, 2, 0, 5, 3, 1, 6)
+    blocks = padded.reshape(nz, LEAF, ny, LEAF, nx, LEAF, 3).transpose(4, 2, 0, 5, 3, 1, 6)
     place = middle
-    for tile in tiles.reshape(-1, LEAF**3, 3):
-        active = tile.any(axis=1)
+    for block in blocks.reshape(-1, LEAF**3, 3):
+        active = block.any(axis=1)
         if active.any():
             bits = np.unpackbits(np.frombuffer(data, np.uint8, 64, place), bitorder="little")
             np.testing.assert_array_equal(bits, active)
             values = np.frombuffer(data, "<f2", 3 * np.count_nonzero(active), place + 65)
-            np.testing.assert_array_equal(values, tile[active].astype(np.float16).ravel())
+            np.testing.assert_array_equal(values, block[active].astype(np.float16).ravel())
             place += 65 + values.nbytes
     assert place == end
 

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from default_run import covering, slow
 from small_liquids import advance, box, create, scene
 from warp_lcp.fluids import LiquidSimulation
-from warp_lcp.material.sources import Sources
+from warp_lcp.material.sources import Sources, lattice_shear
 from warp_lcp.operators.grid_poisson import FLUID, SOLID
 from warp_lcp.run.stepping import take_step
 from warp_lcp.simulation import SimulationFailed
@@ -156,6 +156,71 @@ def test_oblique_inflow_does_not_depend_on_the_steps() -> None:
     assert counts.pop() == pytest.approx(8 * 4 + area * 0.144 * 64**2, abs=row)
 
 
+@pytest.mark.parametrize("velocity", [[0.0, -2.0, 0.0], [1.3, 0.4, 0.0], [-0.6, 0.5, 0.7]])
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_columns_of_a_source_pass_a_plane_across_the_flow_at_even_times(
+    dimension: int, velocity: list[float]
+) -> None:
+    v = np.array(velocity) * (np.arange(3) < dimension)
+    along, shear = lattice_shear(v, dimension)
+    assert shear[along] == 0.0
+    columns = np.stack(np.meshgrid(*[np.arange(7.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    columns = columns[(columns[:, along] == 0) & (columns[:, dimension:] == 0).all(axis=1)]
+    points = columns + np.outer(columns @ shear, np.eye(3)[along])
+    times = np.sort((points @ v / v[along]) % 1.0)
+    gaps = np.diff(np.append(times, times[0] + 1.0)) * len(columns)
+    assert len(columns) == 7 ** (dimension - 1)
+    # Random times have a largest gap of about log n, 2 and 4.
+    assert gaps.max() < (2.0 if dimension == 2 else 2.7)
+    assert gaps.min() > (0.6 if dimension == 2 else 0.1)
+
+
+@pytest.mark.default_cases(2)
+@pytest.mark.parametrize("seed", [3, 4, slow(5), slow(6)])
+def test_a_falling_jet_has_no_layers_across_the_flow(seed: int) -> None:
+    """Jets of random speed, width, angle and Courant number, stretched by gravity.
+
+    A particle's time since it left the source tells the density along the jet, whatever its
+    stretch. In layers a distance d apart these times would be d / v apart, and |sum exp(2 pi i t v
+    / d)|^2 / n as large as n; random times have 1.
+    """
+    draw = np.random.default_rng([20261130, seed])
+    cells, width, thick = int(draw.choice([48, 64, 96])), *draw.integers([2, 1], [7, 4]).tolist()
+    speed, angle = draw.uniform(0.5, 2.0), draw.uniform(-0.8, 0.8) * (seed % 2)
+    dx, across, down = 1.0 / cells, speed * np.sin(angle), speed * np.cos(angle)
+    corner = np.round(np.array([0.5, 0.9]) * cells) * dx
+    far = corner + np.array([width, thick]) * dx
+    simulation = create(
+        scene(
+            size=[1.0, 1.0],
+            resolution=cells,
+            liquid=[],
+            source=[box(corner.tolist(), far.tolist(), velocity=[across, -down])],
+            cfl=float(draw.choice([0.5, 1.0, 2.0, 4.0])),
+            particles={"seed": seed},
+        )
+    )
+
+    def fall(way: np.ndarray) -> np.ndarray:
+        return 2.0 * way / (down + np.sqrt(down**2 + 2.0 * 9.81 * way))
+
+    end, start = float(fall(np.array(0.85))), simulation.particles.count
+    rows = to_frame(simulation, end)
+    assert emitted(rows) == simulation.particles.count - start
+    flow = (down * width + abs(across) * thick) * end * 4.0 / dx
+    # An oblique box cuts columns at its sides, which is random to about 3 particles.
+    assert emitted(rows) == pytest.approx(flow, rel=0.01, abs=1.0 if angle == 0.0 else 9.0)
+    way = corner[1] - simulation.particles.position.numpy()[:, 1]
+    times = fall(np.maximum(way, 0.0))
+    distance = 0.5 * dx / down
+    # Away from the ends: the front falls as one piece.
+    times = times[(way > 2.0 * dx) & (times < end - 6.0 * thick * distance - 0.02)]
+    assert len(times) > 40
+    assert np.diff(np.sort(times)).max() < distance
+    layers = np.abs(np.exp(2j * np.pi * times / distance).sum()) ** 2 / len(times)
+    assert layers < 0.2 * len(times)
+
+
 def mixed(word: np.ndarray) -> np.ndarray:
     """Return the finalizer of SplitMix64 of 64-bit words."""
     word = word + np.uint64(0x9E3779B97F4A7C15)
@@ -184,8 +249,10 @@ def lattice_points(
         drawn = [
             mixed(state + np.uint64((axis + 1) * 0x9E3779B97F4A7C15 % 2**64)) for axis in range(3)
         ]
-    jitter = sources.jitter * (np.stack(drawn, axis=1).astype(np.float64) / 2.0**64 - 0.5)
-    return (lattice + 0.5 + jitter) * (sources.grid.spacing / sources.per_axis)
+    displaced = sources.jitter * (np.stack(drawn, axis=1).astype(np.float64) / 2.0**64 - 0.5)
+    along, shear = lattice_shear(sources.sources[number].velocity, sources.grid.dimension)
+    displaced[:, along] = (lattice @ shear) % 1.0 - 0.5
+    return (lattice + 0.5 + displaced) * (sources.grid.spacing / sources.per_axis)
 
 
 @pytest.mark.parametrize("seed", range(6))

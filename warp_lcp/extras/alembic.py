@@ -27,6 +27,7 @@ from warp_lcp.simulation import Points
 
 if TYPE_CHECKING:
     import imath
+    from alembic3d.Abc import OArchive
     from alembic3d.AbcGeom import (
         OCurves,
         OFloatGeomParam,
@@ -75,34 +76,51 @@ class AlembicArchive:
     """
 
     def __init__(self, folder: Path, recording: Recording, numbers: Sequence[int]) -> None:
-        """Write the data that all frames share."""
-        from alembic3d import Abc
+        """Write the data that all frames share.
 
+        Raises:
+            RuntimeError: the disk is full.
+        """
         scene = recording.scene
         self._recording, self._dimension, self._time = recording, scene.dimension, scene.time
         self._file, self._reserve = folder / "frames.abc", folder / "reserve"
         self._reserve.write_bytes(bytes(CLOSING_BYTES[0] + CLOSING_BYTES[1] * len(numbers)))
         self._line_width = LINE_WIDTH * scene.spacing
-        rate = scene.time.frames_per_second
-        self._archive = Abc.CreateArchiveWithInfo(str(self._file), rate, "warp_lcp", str(folder))
-        self._samples = self._archive.addTimeSampling(_sampling(recording, numbers))
-        self._top = self._archive.getTop()
+        self._archive: OArchive | None = None
+        self._top: OObject | None = None
         self._surface: OPolyMesh | OCurves | None = None
         self._particles: PointsObject | None = None
+        self._whitewater: PointsObject | None = None
+        # Transforms, and shapes in them, which are closed with the archive.
+        self._rigid: list[OXform | OPolyMesh | OCurves] = []
+        self._moving: list[tuple[Motion, OXform]] = []
+        self._bodies: dict[int, tuple[np.ndarray, OXform]] = {}
+        self._added = 0
+        try:
+            self._begin(numbers)
+        except RuntimeError:
+            self._leak()
+            raise
+
+    def _begin(self, numbers: Sequence[int]) -> None:
+        """Create the archive and its objects, and write the solids."""
+        from alembic3d import Abc
+
+        recording, scene = self._recording, self._recording.scene
+        rate, folder = scene.time.frames_per_second, str(self._file.parent)
+        self._archive = Abc.CreateArchiveWithInfo(str(self._file), rate, "warp_lcp", folder)
+        self._samples = self._archive.addTimeSampling(_sampling(recording, numbers))
+        self._top = self._archive.getTop()
         if recording.show in WITH_SURFACE:
             self._surface = self._shape(self._top, "surface", self._samples)
         if recording.show in WITH_PARTICLES:
             self._particles = PointsObject(
                 self._top, "particles", self._samples, recording.particle_spacing()
             )
-        self._whitewater: PointsObject | None = None
         if recording.whitewater(numbers[0]) is not None:
             width = 2.0 * WHITEWATER_RADIUS * scene.spacing
             self._whitewater = PointsObject(self._top, "whitewater", self._samples, width)
-        self._static: list[OPolyMesh | OCurves] = []  # shapes that are closed with the archive
-        self._moving = self._solids()
-        self._bodies: dict[int, tuple[np.ndarray, OXform]] = {}
-        self._added = 0
+        self._add_solids()
 
     def add(self, number: int) -> None:
         """Add a frame.
@@ -140,13 +158,12 @@ class AlembicArchive:
         self._reserve.unlink()
         self._surface = self._particles = self._whitewater = None
         self._top = self._archive = None
-        self._moving, self._bodies, self._static = [], {}, []
+        self._moving, self._bodies, self._rigid = [], {}, []
         gc.collect()
         return self._file
 
     def _leak(self) -> None:
         """Keep all objects until the process ends, since closing would abort it."""
-        places = [place for _, place in (*self._moving, *self._bodies.values())]
         points = [
             one
             for of in (self._particles, self._whitewater)
@@ -154,36 +171,29 @@ class AlembicArchive:
             for one in of.objects
         ]
         objects = (self._surface, *points, self._top, self._archive)
-        for one in (*objects, *places, *self._static):
+        for one in (*objects, *self._rigid):
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(one))
 
-    def _solids(self) -> list[tuple[Motion, OXform]]:
-        """Write the prescribed solids; return motions and transforms of moving ones."""
-        from alembic3d import AbcGeom
-
-        moving = []
+    def _add_solids(self) -> None:
+        """Write the prescribed solids."""
         for number, solid in enumerate(prescribed_solids(self._recording.scene)):
             if isinstance(solid, PlaneTable):  # is unbounded
                 continue
             outline = body_surface(solid.to_geometry(Path(), self._dimension), self._dimension)
             corners = outline.corners[:, ::-1] if solid.invert else outline.corners
             samples = self._samples if solid.motion else STATIC
-            place = AbcGeom.OXform(self._top, f"solid_{number}", samples)
-            self._set_static(place, outline.points, corners)
+            place = self._add_rigid(f"solid_{number}", samples, outline.points, corners)
             if solid.motion:
-                moving.append((solid.motion.to_motion(self._dimension), place))
-        return moving
+                self._moving.append((solid.motion.to_motion(self._dimension), place))
 
     def _set_bodies(self, number: int) -> None:
         """Place rigid bodies; each shape is stored once, relative to its center."""
-        from alembic3d import AbcGeom
-
         bodies, present = self._recording.bodies(number), set()
         for one in () if bodies is None else split_bodies(bodies):
             present.add(one.number)
             if one.number not in self._bodies:
-                place = AbcGeom.OXform(self._top, f"body_{one.number}", self._samples)
-                self._set_static(place, one.points, one.corners)
+                name = f"body_{one.number}"
+                place = self._add_rigid(name, self._samples, one.points, one.corners)
                 self._bodies[one.number] = one.points, place
                 for _ in range(self._added):  # earlier frames without it
                     _set_place(place, one.rotation_from(one.points), one.middle)
@@ -192,10 +202,18 @@ class AlembicArchive:
         for body in self._bodies.keys() - present:
             self._bodies[body][1].getSchema().setFromPrevious()
 
-    def _set_static(self, place: OXform, points: np.ndarray, corners: np.ndarray) -> None:
-        """Add a rigid shape to a transform."""
-        self._static.append(self._shape(place, "shape", STATIC))
-        self._set_shape(self._static[-1], points, corners)
+    def _add_rigid(
+        self, name: str, samples: int, points: np.ndarray, corners: np.ndarray
+    ) -> OXform:
+        """Return a new transform with a rigid shape."""
+        from alembic3d import AbcGeom
+
+        place = AbcGeom.OXform(self._top, name, samples)
+        self._rigid.append(place)
+        shape = self._shape(place, "shape", STATIC)
+        self._rigid.append(shape)
+        self._set_shape(shape, points, corners)
+        return place
 
     def _shape(self, parent: OObject, name: str, samples: int) -> OPolyMesh | OCurves:
         """Return a new mesh of triangles, in 2-D curves of one segment each."""

@@ -1,8 +1,8 @@
 """Sparse trees of voxels, as OpenVDB and NanoVDB store them.
 
-A tree has 5, 4 and 3 bits per axis: a root with one entry, one upper node of 32^3 entries, lower
-nodes of 16^3 entries and leaves of 8^3 voxels. An entry stands for a child, or for a region of one
-value, outside or inside a level set.
+A tree has 5, 4 and 3 bits per axis: a root node with one entry, one upper internal node of 32^3
+entries, lower internal nodes of 16^3 entries and leaf nodes of 8^3 voxels. An entry is a child node
+or a tile: a region of one value, outside or inside a level set.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ LARGEST = LEAF * LOWER * UPPER  # voxels along an edge of an upper node
 
 @dataclass(frozen=True)
 class VoxelTree:
-    """Leaves and lower nodes of a volume, in the order of their positions (x, y, z).
+    """Leaf nodes and lower nodes of a volume, in the order of their positions (x, y, z).
 
     Args:
         background: value outside: the width of the band of a level set [m], else 0.
-        low: first voxel (x, y, z) of each leaf, shape (leaves, 3).
-        values: float32 voxels of the leaves, x slowest, shape (leaves, 512); of a vector field
+        low: first voxel (x, y, z) of each leaf node, shape (leaves, 3).
+        values: float32 voxels of the leaf nodes, x slowest, shape (leaves, 512); of a vector field
             (leaves, 512, 3). Those of a level set are clipped to its band.
         active: whether a voxel lies within the band, or is not 0, shape (leaves, 512).
-        kinds: entries of the lower nodes, shape (nodes, 4096): 0 outside, -1 inside, else the
-            number of a leaf, from 1.
+        kinds: entries of the lower nodes, shape (nodes, 4096): 0 a tile outside, -1 one inside,
+            else the number of a leaf node, from 1.
         lower_places: entry of each lower node in the upper one.
     """
 
@@ -59,18 +59,18 @@ class VoxelTree:
                 f"{LARGEST} along an axis"
             )
         background = np.float32(0.0 if band is None else band)
-        tiles = _tiles(values, background)
+        blocks = _leaf_blocks(values, background)
         voxels = (3, 4, 5)  # axes
         if values.ndim == 4:
-            used = np.asarray(tiles.any(axis=(*voxels, 6)))
+            used = np.asarray(blocks.any(axis=(*voxels, 6)))
             inside = np.zeros_like(used)
         elif band is None:
-            used = np.asarray(tiles.max(axis=voxels) > 0.0)
+            used = np.asarray(blocks.max(axis=voxels) > 0.0)
             inside = np.zeros_like(used)
         else:
-            inside = np.asarray(tiles.max(axis=voxels) <= -background)
-            used = np.asarray(tiles.min(axis=voxels) < background) & ~inside
-        stored = tiles[used].reshape(-1, LEAF**3, *values.shape[3:])
+            inside = np.asarray(blocks.max(axis=voxels) <= -background)
+            used = np.asarray(blocks.min(axis=voxels) < background) & ~inside
+        stored = blocks[used].reshape(-1, LEAF**3, *values.shape[3:])
         if values.ndim == 4:
             active = np.asarray(stored.any(axis=2))
         elif band is None:
@@ -82,10 +82,10 @@ class VoxelTree:
         return cls(background, LEAF * np.argwhere(used), stored, active, kinds, places)
 
 
-def _tiles(values: np.ndarray, background: np.float32) -> np.ndarray:
-    """Return a view of the values by tile, shape (nx, ny, nz, 8, 8, 8), with vectors (..., 3).
+def _leaf_blocks(values: np.ndarray, background: np.float32) -> np.ndarray:
+    """Return the values by blocks of a leaf node, shape (nx, ny, nz, 8, 8, 8), or (..., 3).
 
-    With nx, ny and nz tiles; voxels beyond the grid have the background value.
+    With nx, ny and nz blocks; voxels beyond the grid have the background value.
     """
     nz, ny, nx = counts = [-(-count // LEAF) for count in values.shape[:3]]
     shape = (*(LEAF * count for count in counts), *values.shape[3:])

@@ -36,12 +36,18 @@ CROWD = 0.1
 # 1 - 2 s, with s the smoothed share in it. Uneven particles need more, or there are holes.
 UNEVEN = 1.6
 SAMPLED = 0.25  # variance that interpolation by quadratic B-splines adds [lattice cells^2]
+# Standard deviation of the kernel behind the curvature: times that of the share, at least 2.5
+# particle distances. Otherwise bumps of particles grow.
+WIDER, WIDE = 5.0 / 3.0, 2.5
+# Curvatures, times the spread. Below the first a surface is taken for plane: five times the RMS
+# curvature of a stirred pool. The other is that of a ball of 3/4 of the spread.
+BEADS, SHARPEST_BALL = 0.15, 1.5
 # Rounds of smoothing the mesh: facets as large as lattice cells are gone, and 0.1 % of the volume.
 ROUNDS = 3
 SEEN = 2 * ROUNDS + 1  # lattice cells around a cell that its smoothed points depend on
 OUTSIDE = 1.0  # value outside of the surface, in the ring at cuts
 # Bytes of a lattice cell; and more where there are solids.
-MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 12, 9
+MESH_LATTICE_BYTES, MESH_SOLID_BYTES = 16, 13
 MESH_POINT_BYTES = 80  # bytes of a point, with its triangles and its velocity
 
 
@@ -98,11 +104,11 @@ class SurfaceMesh:
     The density of the particles is computed on a lattice finer than the grid, smoothed over
     `smoothing` particle distances, and divided by the open part of the kernel beside solids and
     walls: the filled share. The surface is where this share is 1/2. It is unbiased for a plane, and
-    flat at walls that the plane meets at a right angle; a ball of radius R shrinks by up to
-    smoothing^2 / R [particle distances]. In drops, filaments and sheets too thin for the kernel,
-    narrow kernels of the particles are added to the share. Their weight grows as the fullness
-    falls, see the kernel `boost`, so that a drop of one particle remains. The surface is cut along
-    walls, solids and the domain's sides, open and periodic ones included.
+    flat at walls that the plane meets at a right angle; where it is curved, it is moved back by as
+    much as smoothing has moved it, see the kernel `restore`. In drops, filaments and sheets too
+    thin for the kernel, narrow kernels of the particles are added to the share. Their weight grows
+    as the fullness falls, see the kernel `boost`, so that a drop of one particle remains. The
+    surface is cut along walls, solids and the domain's sides, open and periodic ones included.
 
     Args:
         grid: the grid.
@@ -139,9 +145,11 @@ class SurfaceMesh:
         self.lattice = grid.refined(parts)
         distance = parts / per_axis  # distance of particles at rest, in lattice cells
         self._each = distance**grid.dimension
-        self._thin_passes, self._passes = (
-            max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25))) for sigma in (SHARPEST, smoothing)
+        self._thin_passes, self._passes, wide_passes = (
+            max(0, round(2.0 * ((sigma * distance) ** 2 - 0.25)))
+            for sigma in (SHARPEST, smoothing, max(WIDER * smoothing, WIDE))
         )
+        self._more_passes = wide_passes - self._passes
         self._spread = math.sqrt(0.25 + 0.5 * self._passes)
         # A drop of one particle has at least 2^-dimension of its narrow kernel on one lattice node.
         # That value is scaled to the share 1/2.
@@ -156,9 +164,10 @@ class SurfaceMesh:
             self._most / (math.sqrt(kernels.THIN / alone) - 1.0),
             UNEVEN * (1.0 - 2.0 * layer) / (math.sqrt(kernels.THIN / layer) - 1.0),
         )
-        self._fields = [self.lattice.field() for _ in range(3)]
+        self._fields = [self.lattice.field() for _ in range(4)]
         self._room = self.lattice.field() if obstacles else None
         self._capacity = self.lattice.field() if obstacles else None
+        self._wide_capacity = self.lattice.field() if obstacles else None
         self._known = self.lattice.field(wp.int8) if obstacles else None
         self._cubes = MarchingCubes(self.lattice)
         self._placed = False
@@ -177,7 +186,7 @@ class SurfaceMesh:
         lattice = self.lattice
         if self.obstacles is not None and (self.obstacles.moves or not self._placed):
             self._place(self.obstacles)
-        raw, first, second = self._fields
+        raw, first, second, free = self._fields
         raw.zero_()
         scatter(
             SCATTER,
@@ -200,7 +209,7 @@ class SurfaceMesh:
             lattice.domain.launch(kernels.fill_kernel, inputs)
             self._mirror(raw)
         smooth = self._smoothed(raw, first, second, self._passes)
-        thin, phi = (field for field in self._fields if field is not smooth)
+        thin, phi = (field for field in (raw, first, second) if field is not smooth)
         thin.zero_()
         launch(
             kernels.BOOST,
@@ -230,10 +239,32 @@ class SurfaceMesh:
             planes=lattice.planes,
             spread=self._spread,
         )
+        wide = self._smoothed(smooth, free, smooth, self._more_passes)
+        self._restore(phi, thin, wide)
         if self._room is not None:
             extrapolate(window, self._known, phi, EXTENDED)
             window.run(kernels.CARVE, room=self._room, phi=phi)
-        return self._mesh(phi, smooth.view(wp.int32))
+        return self._mesh(phi, wide.view(wp.int32))
+
+    def _restore(self, phi: wp.array, thin: wp.array, wide: wp.array) -> None:
+        """Move a curved surface back by as much as smoothing has moved it.
+
+        Args:
+            phi: distance [lattice cells] (updated).
+            thin: share of the narrow kernels.
+            wide: the smoothed share, smoothed further.
+        """
+        self.lattice.domain.run(
+            kernels.RESTORE,
+            phi=phi,
+            thin=thin,
+            wide=wide,
+            capacity=self._wide_capacity,
+            planes=self.lattice.planes,
+            variance=self._spread**2,
+            beads=BEADS / self._spread,
+            most=SHARPEST_BALL / self._spread,
+        )
 
     def _lattice_cells(self) -> Window:
         """Return the lattice cells that have their low node in this rank's box.
@@ -325,7 +356,10 @@ class SurfaceMesh:
         self._mirror(room)
         lattice.everywhere.launch(kernels.open_share_kernel, [room, capacity])
         passes = self._passes + 1  # a cell's own extent widens the kernel by about as much
-        wp.copy(capacity, self._smoothed(capacity, self._fields[0], self._fields[1], passes))
+        first, second = self._fields[:2]
+        wp.copy(capacity, self._smoothed(capacity, first, second, passes))
+        wide = self._smoothed(capacity, first, second, self._more_passes)
+        wp.copy(self._wide_capacity, wide)
         self._placed = True
 
     def _smoothed(

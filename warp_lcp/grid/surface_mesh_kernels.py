@@ -20,6 +20,8 @@ LEAST_OPEN = 0.25
 THIN = 1.0
 # Share of a particle's lattice cell from which on the fullness at the particle is not below THIN.
 CROWDED = 0.8
+# Share of the narrow kernels from which on a surface is not moved back: they have filled it.
+FILLED = 0.18
 
 
 _options = {"module": "warp_lcp.grid.surface_mesh"}
@@ -27,11 +29,12 @@ _options = {"module": "warp_lcp.grid.surface_mesh"}
 
 KERNELS = KernelFile(
     Path(__file__).parent / "headers/surface_mesh.h",
-    {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "CROWDED": CROWDED},
+    {"LEAST_OPEN": LEAST_OPEN, "THIN": THIN, "CROWDED": CROWDED, "FILLED": FILLED},
 )
 DISTANCE = KERNELS["warp_lcp.grid.surface_mesh.surface_distance"]
 ROOM = KERNELS["warp_lcp.grid.surface_mesh.room"]
 CARVE = KERNELS["warp_lcp.grid.surface_mesh.carve"]
+RESTORE = KERNELS["warp_lcp.grid.surface_mesh.restore"]
 BOOST = KERNELS["warp_lcp.grid.surface_mesh.boost"]
 
 

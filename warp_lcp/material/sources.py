@@ -25,6 +25,7 @@ from warp_lcp.operators.grid_poisson import SOLID
 NOW = 1e-9  # s: rounding error of a time at which a step ends
 GRAZED = 1e-9  # fraction of a path: a shorter piece in a cell is rounding
 FILLED = 0.5  # fraction of a full cell: a source that starts fills cells with less
+GOLDEN_STEPS = 64  # steps of a fixed point iteration, each of which gains half a digit
 JAMMED = 2.0  # fraction of a full cell: a cell with more gets no more particles
 
 
@@ -60,9 +61,12 @@ class Sources:
     have its velocity, and the pressure treats the cells as a solid that moves at it: the outflow is
     area times velocity, whatever is in the way. Material behind a source is not drawn in.
 
-    Particles lie on a jittered lattice that moves with the source; those that the lattice moves
-    into the cells in a step are new. The lattice is a function of time alone, so that a resumed run
-    is bitwise identical. A source that starts fills its cells, unless they are full already.
+    Particles lie on a lattice that moves with the source; those that the lattice moves into the
+    cells in a step are new. The lattice is a function of time alone, so that a resumed run is
+    bitwise identical. A source that starts fills its cells, unless they are full already.
+
+    The lattice is sheared along the flow, see `lattice_shear`, and jittered across it. A lattice
+    with layers across the flow would become rods when a falling sheet or jet is stretched.
 
     A step need not end where a source starts or stops. The particles that enter are exactly those
     that the lattice brings in from start to stop, however the time is divided into steps. The flow
@@ -73,7 +77,7 @@ class Sources:
         boundary: solids and walls; with whole cells it has velocities.
         sources: a cell belongs to the first that contains its center.
         per_axis: particles along the edge of a cell.
-        jitter: width of their random displacement, a fraction of their distance.
+        jitter: width of their random displacement across the flow, a fraction of their distance.
         random_seed: seed of the displacements.
 
     Raises:
@@ -315,9 +319,12 @@ class Sources:
         (random_seed + number) * 0x9E3779B97F4A7C15 + 1 modulo 2^64, as a signed number.
         """
         grid, seed = self.grid, (self.random_seed + number) * 0x9E3779B97F4A7C15 + 1
+        along, shear = lattice_shear(self.sources[number].velocity, grid.dimension)
         size = dict(zip(("size_x", "size_y", "size_z"), map(float, grid.extent), strict=True))
+        size |= dict(zip(("shear_x", "shear_y", "shear_z"), shear.tolist(), strict=True))
         numbers = {
             "number": number,
+            "along": along,
             "nx": grid.shape[2],
             "ny": grid.shape[1],
             "nz": grid.shape[0],
@@ -427,6 +434,36 @@ class Sources:
             )
         if cells is not None:
             self._window.launch(kernels.occupy_kernel, [*self._fields, int(not supply), cells])
+
+
+def lattice_shear(velocity: np.ndarray, dimension: int) -> tuple[int, np.ndarray]:
+    """Shear a lattice so that it has no layers across a flow.
+
+    With axis a, the sheared lattice has the points n + e_a (s_b n_b + s_c n_c), n of integers.
+    Those that pass a plane across the flow v at one time have the same v p / v_a, which is
+
+        n_a + alpha_b n_b + alpha_c n_c,   alpha_b = s_b + v_b / v_a.
+
+    With alpha = 1 / g in 2-D, and 1 / g, 1 / g^2 in 3-D, where g^(d+1) = g + 1 for d axes across
+    the flow, these times are evenly spread, in whatever part of the columns (Kronecker sequence). A
+    flow that is stretched along v keeps its points apart: in 2-D g is the golden ratio, and of all
+    lattices, stretched or not, that of the golden ratio has the largest least distance (Hurwitz).
+
+    Args:
+        velocity: v [m/s], shape (3,), not 0.
+        dimension: 2 or 3.
+
+    Returns:
+        a, the axis nearest to the flow, and s, shape (3,), 0 along a.
+    """
+    along, shear = int(np.argmax(np.abs(velocity))), np.zeros(3)
+    across = [axis for axis in range(dimension) if axis != along]
+    g = 1.0
+    for _ in range(GOLDEN_STEPS):
+        g = (1.0 + g) ** (1.0 / (len(across) + 1))
+    for power, axis in enumerate(across, start=1):
+        shear[axis] = g**-power - float(velocity[axis]) / float(velocity[along])
+    return along, shear
 
 
 def _owners(grid: StaggeredGrid, boundary: Boundary, sources: Sequence[Source]) -> np.ndarray:

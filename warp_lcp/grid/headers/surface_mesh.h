@@ -140,6 +140,54 @@ for (int start = first; start < last; start += M) {
     }
 }
 
+// kernel warp_lcp.grid.surface_mesh.restore: Move a curved surface back by as much as smoothing has
+// moved it. A Gaussian of variance V moves the surface of a ball, with curvature kappa = 2 / R (the
+// sum of both), inward by V / R = V kappa / 2, up to terms of (spread / R)^4: phi -= V kappa / 2.
+// The curvature kappa = -div(grad f / |grad f|) is that of the contours of the share f, smoothed
+// further so that bumps of the particles are not amplified: contours of a ball or cylinder stay
+// round. Most curvatures below `beads` [1 / lattice cells] are the particles': kappa becomes
+// kappa^3 / (kappa^2 + beads^2). Sheets are plane, and keep their thickness.
+//   compute    float32
+//   box        float32 phi, thin, wide, capacity?
+//   numbers    int planes; float32 variance, beads, most
+//   constants  LEAST_OPEN, FILLED
+const float shift = 0.5f * variance, near = 1.5f + shift * most;
+auto open_share = [&](long long at) {
+    return capacity[at] > (float)LEAST_OPEN ? capacity[at] : (float)LEAST_OPEN;
+};
+auto share = [&](long long at) { return capacity ? wide[at] / open_share(at) : wide[at]; };
+for (int i = first; i < last; ++i) {
+    if (phi[i] > near || phi[i] < -near) continue;
+    // Beside solids the share is that of the open part, down to the solid's surface.
+    if (capacity && capacity[i] < 0.5f) continue;
+    const float open = capacity ? open_share(i) : 1.0f;
+    const float part = 1 - thin[i] / ((float)FILLED * open);
+    if (part <= 0) continue;
+    // Gradient and second derivatives, by central differences; z and its mixed ones are 0 in 2-D.
+    const long long step[3] = {1, s2, s1};
+    const float middle = share(i);
+    float slope[3] = {0, 0, 0}, second[3] = {0, 0, 0}, mixed[3] = {0, 0, 0};
+    for (int a = 0; a <= planes; ++a) {
+        const float low = share(i - step[a]), high = share(i + step[a]);
+        slope[a] = 0.5f * (high - low);
+        second[a] = high - 2 * middle + low;
+        for (int b = 0; b < a; ++b)  // (x, y), (x, z), (y, z) are numbered 0, 1, 2
+            mixed[a + b - 1] =
+                0.25f * (share(i + step[a] + step[b]) - share(i + step[a] - step[b]) -
+                         share(i - step[a] + step[b]) + share(i - step[a] - step[b]));
+    }
+    const float x = slope[0] * slope[0], y = slope[1] * slope[1], z = slope[2] * slope[2],
+                steep = x + y + z;
+    if (steep < 1e-8f) continue;
+    const float across = x * (second[1] + second[2]) + y * (second[0] + second[2]) +
+                         z * (second[0] + second[1]) -
+                         2 * (slope[0] * slope[1] * mixed[0] + slope[0] * slope[2] * mixed[1] +
+                              slope[1] * slope[2] * mixed[2]);
+    const float bend = -across / (steep * sqrtf(steep)), squared = bend * bend;
+    const float kappa = bend * squared / (squared + beads * beads);
+    phi[i] -= shift * part * (kappa > most ? most : kappa < -most ? -most : kappa);
+}
+
 // kernel warp_lcp.grid.mesh_smoothing.see_neighbors: Sum of the neighbors of each point, and their
 // number. A closed surface has each edge once in either direction, so that each neighbor is added
 // once. The points of an outline have two neighbors.

@@ -261,8 +261,9 @@ if (shorter) changed[0] = 1;
 //   compute    float64
 //   whole      int32 slots, owner, filled, slot; vec3 point; float64 span
 //   box        int32 entries
-//   numbers    int number, planes, nx, ny, nz, before_x, before_y, before_z; int64 seed;
-//              float64 dx, distance, jitter, grazed, margin, size_x, size_y, size_z
+//   numbers    int number, planes, nx, ny, nz, before_x, before_y, before_z, along; int64 seed;
+//              float64 dx, distance, jitter, grazed, margin, size_x, size_y, size_z, shear_x,
+//              shear_y, shear_z
 EXACT_MATH
 typedef unsigned long long Word;
 // times: span[3*time + axis] is the displacement of the lattice since the source's start
@@ -270,7 +271,7 @@ enum { SINCE, UNTIL, NOW };
 const double* lowest = span + 9;
 const long long wide = (long long)span[12], high = (long long)span[13];
 const int stored[3] = {nx, ny, nz}, origin[3] = {before_x, before_y, before_z};
-const double size[3] = {size_x, size_y, size_z};
+const double size[3] = {size_x, size_y, size_z}, shear[3] = {shear_x, shear_y, shear_z};
 auto mixed = [](Word word) {  // finalizer of SplitMix64
     word += 0x9E3779B97F4A7C15ull;
     word = (word ^ (word >> 30)) * 0xBF58476D1CE4E5B9ull;
@@ -305,6 +306,11 @@ auto place_of = [&](long long p) {
         const Word drawn = mixed(state + (Word)(axis + 1) * 0x9E3779B97F4A7C15ull);
         at.displaced[axis] = jitter * ((double)drawn / 18446744073709551616.0 - 0.5);
     }
+    // A column along the flow moves by its share of the distance, so that columns do not form
+    // layers across the flow. Its points are evenly spaced: each stretch of it has its share.
+    double moved = 0;
+    for (int axis = 0; axis < 3; ++axis) moved += shear[axis] * at.lattice[axis];
+    at.displaced[along] = moved - ::floor(moved) - 0.5;
     return at;
 };
 auto put = [&](const Place& at, int time, double* x) {
