@@ -59,6 +59,7 @@ HIGHEST = 3  # number of columns whose mean is the height
 
 # 3-D
 Shape = Literal["cone", "wedge"]
+SHAPES: tuple[Shape, ...] = ("cone", "wedge")
 SPATIAL_ANGLES = (20.0, 30.0)  # degrees, of repose
 ACROSS = (24, 36)  # cells of the domain's side
 SIDE, SLICE = 0.3, 4  # [m] domain's side; thickness of a wedge's slice [cells]
@@ -413,19 +414,28 @@ def fit(line: Outline, shape: Callable[[np.ndarray], np.ndarray]) -> tuple[float
 
 def alike(findings: Findings, trials: Sequence[ValidationTrial]) -> None:
     """Compare the heaps of both resolutions."""
-    for angle in ANGLES:
-        coarse, fine = (t.value(f"{angle:g} degrees: heap") for t in trials[:2])
-        findings.add(
-            f"{angle:g} degrees: |difference of the heaps|",
-            abs(fine - coarse),
-            high=ALIKE,
-            unit="degrees",
-        )
+    pairs = [("", ANGLES, trials[:2])] + [
+        (f"{shape}, ", SPATIAL_ANGLES, [t for t in trials if t.resolution.startswith(shape)])
+        for shape in SHAPES
+    ]
+    for what, angles, (coarse, fine) in pairs:
+        for angle in angles:
+            heap = f"{angle:g} degrees: heap"
+            findings.add(
+                f"{what}{angle:g} degrees: |difference of the heaps|",
+                abs(fine.value(heap) - coarse.value(heap)),
+                high=ALIKE,
+                unit="degrees",
+            )
 
 
 CHECK = ValidationCheck(
     about=__doc__ or "",
-    trials=[(heaps, RESOLUTIONS), (wedges, RESOLUTIONS)],
+    trials=[
+        (heaps, RESOLUTIONS),
+        (wedges, RESOLUTIONS),
+        (spatial_heaps, [(shape, cells) for shape in SHAPES for cells in ACROSS]),
+    ],
     across=("both", alike),
     charts=[plot("sand-heaps", "Heaps and wedges", "x [m]", "y [m]")],
     known="single heaps differ by up to 1.4 degrees from the mean over seeds of the particles; at "

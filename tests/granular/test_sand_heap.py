@@ -67,6 +67,29 @@ def test_an_outline_holds_the_sand() -> None:
     assert sand_heap.fit((x, y), sand_heap.wedge)[0] == pytest.approx(27.0, abs=0.3)
 
 
+def test_a_flat_cone_stands_and_a_steep_one_slumps() -> None:
+    flat, steep = (
+        sand_heap.slope_lost("cone", 12, 30.0, slope, duration=STANDS) for slope in (27.0, 42.0)
+    )
+    assert flat < sand_heap.SAGS
+    assert steep > 4.0
+
+
+def test_a_cone_is_measured_around_its_axis() -> None:
+    simulation = sand_heap.cut_spatial("cone", 24, 30.0, 30.0)
+    for diagonal in (None, False, True):
+        line = sand_heap.spatial_outline(simulation, shape="cone", diagonal=diagonal)
+        assert sand_heap.fit(line, sand_heap.wedge)[0] == pytest.approx(30.0, abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["cone", "wedge"])
+def test_a_heap_in_3d_has_the_angle_of_repose(shape: sand_heap.Shape) -> None:
+    heap, _ = sand_heap.pour_spatial(shape, 24, 30.0)
+    assert heap.angle == pytest.approx(30.0, abs=sand_heap.NEAR)
+    assert abs(heap.creep) < sand_heap.CREEP
+
+
 @pytest.mark.slow
 def test_a_heap_poured_slowly_lies_where_sand_stops_and_stays() -> None:
     heap = sand_heap.pour(96, 20.0, lasts=2.0)
