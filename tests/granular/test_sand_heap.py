@@ -67,12 +67,14 @@ def test_an_outline_holds_the_sand() -> None:
     assert sand_heap.fit((x, y), sand_heap.wedge)[0] == pytest.approx(27.0, abs=0.3)
 
 
-def test_a_flat_cone_stands_and_a_steep_one_slumps() -> None:
-    flat, steep = (
-        sand_heap.slope_lost("cone", 12, 30.0, slope, duration=STANDS) for slope in (27.0, 42.0)
-    )
-    assert flat < sand_heap.SAGS
-    assert steep > 4.0
+@pytest.mark.parametrize(("angle", "slope"), [(30.0, 27.0), (30.0, 37.0), (22.0, 27.0)])
+def test_a_cone_stands_or_slumps_as_its_angle_says(angle: float, slope: float) -> None:
+    """Rest of cones flatter than the angle of repose.
+
+    Compression along one axis alone would let sand of 30 degrees yield at 23.8.
+    """
+    loses = sand_heap.slope_lost("cone", 12, angle, slope, duration=0.3)
+    assert loses < sand_heap.SAGS if slope < angle else loses > 4.0 * sand_heap.SAGS
 
 
 def test_a_cone_is_measured_around_its_axis() -> None:
