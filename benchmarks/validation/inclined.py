@@ -20,6 +20,7 @@ sqrt(max_fraction g cos(slope)) (H^1.5 - (H - y)^1.5).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -41,6 +42,7 @@ from warp_lcp.material.particle_assembly import GridComponents
 
 DEPTH, LENGTH = 0.32, 0.16  # [m] depth of the layer and length of the domain
 RESOLUTIONS = (16, 32)  # cells of the depth
+WIDE = 4  # cells of the length of layers in 3-D
 DT = 2e-3  # [s] at 16 cells
 # [s] Durations of running, settling and resting.
 RUNS, SETTLES, RESTS = 0.2, 0.12, 0.4
@@ -198,6 +200,37 @@ def runs(cells: int, angle: float, *, speed: float = START, **tables: TableValue
     return float(np.polyfit(time[half], mean[half], 1)[0])
 
 
+def runs_obliquely(cells: int, angle: float, azimuth: float) -> float:
+    """Return the acceleration of running sand in 3-D along its slope [m/s^2].
+
+    Args:
+        cells: cells of the depth.
+        angle: slope [degrees].
+        azimuth: direction of the slope in the x-z plane, from the x axis [degrees].
+    """
+    dx, turn, tilt = DEPTH / cells, math.radians(azimuth), math.radians(angle)
+    along = np.array([math.cos(turn), 0.0, math.sin(turn)])
+    size = [WIDE * dx, 1.5 * DEPTH, WIDE * dx]
+    down = GRAVITY * (math.sin(tilt) * along - math.cos(tilt) * np.array([0.0, 1.0, 0.0]))
+    simulation = create_sand(
+        size,
+        3 * cells // 2,
+        [box([0.0, 0.0, 0.0], [size[0], DEPTH, size[2]], velocity=(START * along).tolist())],
+        domain={
+            "size": size,
+            "resolution": 3 * cells // 2,
+            "periodic": [True, False, True],
+            "friction": ROUGH,
+        },
+        physics={"gravity": down.tolist()},
+        material={"friction_angle": FRICTION_ANGLE} | SHEARED,
+        particles={"jitter": 0.0},
+    )
+    time, mean = _watch(simulation, cells, RUNS, along)
+    half = time > 0.5 * RUNS
+    return float(np.polyfit(time[half], mean[half], 1)[0])
+
+
 def rests(cells: int, angle: float, **tables: TableValue) -> tuple[float, float]:
     """Return the acceleration [g] of sand that settled level and is then tilted.
 
@@ -239,17 +272,22 @@ def _create(
 
 
 def _watch(
-    simulation: SandSimulation, cells: int, duration: float
+    simulation: SandSimulation,
+    cells: int,
+    duration: float,
+    along: Sequence[float] | np.ndarray = (1.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Step for a time; return times [s] and mean velocities along the slope [m/s].
 
-    There is one entry for each step.
+    There is one entry for each step. `along` is the direction of the slope.
     """
     dt = DT * RESOLUTIONS[0] / cells
     mean = []
     for _ in range(round(duration / dt)):
         simulation.step(dt)
-        mean.append(float(simulation.particles.velocity.numpy()[:, 0].mean(dtype=np.float64)))
+        mean.append(
+            float(simulation.particles.velocity.numpy().mean(axis=0, dtype=np.float64) @ along)
+        )
     return dt * np.arange(1, len(mean) + 1), np.array(mean)
 
 

@@ -36,3 +36,11 @@ def test_a_layer_that_runs_comes_to_rest_where_it_should() -> None:
     slower = inclined.runs(16, 22.0)
     assert slower == pytest.approx(inclined.accelerates(22.0), rel=0.01)
     assert slower < -0.8
+
+
+@pytest.mark.parametrize(("azimuth", "slope"), [(0.0, 22.0), (37.0, 30.0)])
+def test_a_layer_in_3d_runs_as_the_sand_s_friction_says(azimuth: float, slope: float) -> None:
+    """Acceleration of a running layer in 3-D, along an axis of the grid and obliquely to it."""
+    assert inclined.runs_obliquely(8, slope, azimuth) == pytest.approx(
+        inclined.accelerates(slope), abs=1e-3 * inclined.GRAVITY
+    )

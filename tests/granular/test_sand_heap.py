@@ -67,6 +67,31 @@ def test_an_outline_holds_the_sand() -> None:
     assert sand_heap.fit((x, y), sand_heap.wedge)[0] == pytest.approx(27.0, abs=0.3)
 
 
+@pytest.mark.parametrize(("angle", "slope"), [(30.0, 27.0), (30.0, 37.0), (22.0, 27.0)])
+def test_a_cone_stands_or_slumps_as_its_angle_says(angle: float, slope: float) -> None:
+    """Rest of cones flatter than the angle of repose.
+
+    Compression along one axis alone would let sand of 30 degrees yield at 23.8.
+    """
+    loses = sand_heap.slope_lost("cone", 12, angle, slope, duration=0.3)
+    assert loses < sand_heap.SAGS if slope < angle else loses > 4.0 * sand_heap.SAGS
+
+
+def test_a_cone_is_measured_around_its_axis() -> None:
+    simulation = sand_heap.cut_spatial("cone", 24, 30.0, 30.0)
+    for diagonal in (None, False, True):
+        line = sand_heap.spatial_outline(simulation, shape="cone", diagonal=diagonal)
+        assert sand_heap.fit(line, sand_heap.wedge)[0] == pytest.approx(30.0, abs=0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("shape", ["cone", "wedge"])
+def test_a_heap_in_3d_has_the_angle_of_repose(shape: sand_heap.Shape) -> None:
+    heap, _ = sand_heap.pour_spatial(shape, 24, 30.0)
+    assert heap.angle == pytest.approx(30.0, abs=sand_heap.NEAR)
+    assert abs(heap.creep) < sand_heap.CREEP
+
+
 @pytest.mark.slow
 def test_a_heap_poured_slowly_lies_where_sand_stops_and_stays() -> None:
     heap = sand_heap.pour(96, 20.0, lasts=2.0)
