@@ -185,7 +185,8 @@ def test_a_falling_jet_has_no_layers_across_the_flow(seed: int) -> None:
     / d)|^2 / n as large as n; random times have 1.
     """
     draw = np.random.default_rng([20261130, seed])
-    cells, width, thick = int(draw.choice([48, 64, 96])), *draw.integers([2, 1], [7, 4]).tolist()
+    cells = int(draw.choice([48, 64, 96]))
+    width, thick = int(draw.integers(2, 7)), int(draw.integers(1, 4))
     speed, angle = draw.uniform(0.5, 2.0), draw.uniform(-0.8, 0.8) * (seed % 2)
     dx, across, down = 1.0 / cells, speed * np.sin(angle), speed * np.cos(angle)
     corner = np.round(np.array([0.5, 0.9]) * cells) * dx
