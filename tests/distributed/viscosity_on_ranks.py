@@ -23,7 +23,7 @@ STIFF = {"value": 300.0, "splitting_tolerance": math.inf}
 
 
 def applied(simulation: LiquidSimulation, whole: np.ndarray) -> list[np.ndarray]:
-    """Return z = M r and A z on the cells of a simulation, shape (d, nz, ny, nx).
+    """Return z = M r, A z, and z of a light cycle on the cells, shape (d, nz, ny, nx).
 
     r is that of the whole grid.
     """
@@ -40,9 +40,11 @@ def applied(simulation: LiquidSimulation, whole: np.ndarray) -> list[np.ndarray]
     multigrid.r.assign(r.ravel())
     multigrid.apply()
     multigrid.product(multigrid.z, q)
+    z = wp.clone(multigrid.z)
+    multigrid.light_program().run()
     return [
         np.array([field.numpy()[inside] for field in multigrid.components(each)])
-        for each in (multigrid.z, q)
+        for each in (z, q, multigrid.z)
     ]
 
 
