@@ -132,8 +132,7 @@ const auto apart = [&](long long i, int a, int b) {  // whether edge i is betwee
         const int axis = f < 2 ? a : b;
         const long long q = faces[f];
         if (!(d[axis][q] <= (float)CLOSE)) continue;
-        const int number =
-            BODIES && wall[axis][BODIES ? q : 0] > 0 ? wall[axis][BODIES ? q : 0] : 0;
+        const int nearest = wall[axis][BODIES ? q : 0], number = nearest > 0 ? nearest : 0;
         const bool emits = source(q, step[axis]);
         bodies = bodies || (!emits && body[BODIES ? number : 0] >= 0);
         const int owner = emits ? 1 << 16 : number;
@@ -208,8 +207,8 @@ for (int i = first; i < last; ++i) {
                 !(h[axis][q] < INFINITY) ? 0.0f : (length * factor > 1.0f ? 1.0f / length : factor);
         }
         const float thickness = factor * scale * viscosity(on_edges[e], i);
-        edge[e][i] =
-            wall && (released || !held || apart(i, a, b)) ? 0.0f : thickness * filled(cells, 4);
+        const bool free = wall && (released || !held || apart(i, a, b));
+        edge[e][i] = free ? 0.0f : thickness * filled(cells, 4);
     }
 }
 

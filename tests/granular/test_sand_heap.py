@@ -87,8 +87,12 @@ def test_a_cone_is_measured_around_its_axis() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("shape", ["cone", "wedge"])
 def test_a_heap_in_3d_has_the_angle_of_repose(shape: sand_heap.Shape) -> None:
+    """Between the slope at which layers stop and that at which sand at rest yields."""
     heap, _ = sand_heap.pour_spatial(shape, 24, 30.0)
-    assert heap.angle == pytest.approx(30.0, abs=sand_heap.NEAR)
+    k = 0.5 * (math.sin(math.radians(30.0)) + math.tan(math.radians(30.0)))
+    one_seed = 1.4  # degrees between heaps of different seeds and their mean
+    assert heap.angle > math.degrees(math.atan(k)) - one_seed
+    assert heap.angle < math.degrees(math.asin(k)) + one_seed
     assert abs(heap.creep) < sand_heap.CREEP
 
 
