@@ -249,7 +249,7 @@ def _iterations(cells: int, ratio: float, *, corrected: bool) -> int:
     )
     if not corrected:
         simulation.projection._make_problem()
-        simulation.projection._work.correction.renew = lambda begins: False
+        simulation.projection._work.correction.renew = lambda **_: False
     return int(simulation.step(2e-3)["solve_iterations"])  # type: ignore[arg-type]
 
 

@@ -16,7 +16,7 @@ import warp_lcp.benchmarks.__main__ as process
 from warp_lcp.benchmarks import validation
 from warp_lcp.benchmarks.harness.record import RecordLines
 from warp_lcp.benchmarks.suite import VALIDATION
-from warp_lcp.benchmarks.validation import dam_break, rest, signals, transfers, walls
+from warp_lcp.benchmarks.validation import dam_break, floating, rest, signals, transfers, walls
 from warp_lcp.benchmarks.validation.finding import (
     Finding,
     Findings,
@@ -286,6 +286,15 @@ def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
 
 
 @pytest.mark.parametrize("error", [0.5, 2.0])
+def test_light_bodies_take_more_iterations_without_the_correction() -> None:
+    heavy, light, uncorrected = (
+        floating._iterations(12, ratio, corrected=corrected)
+        for ratio, corrected in ((1.0, True), (1e-3, True), (1e-3, False))
+    )
+    assert light <= 1.5 * heavy
+    assert uncorrected > 1.5 * heavy
+
+
 def test_a_failed_check_ends_the_process_with_1_after_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
