@@ -285,7 +285,6 @@ def test_a_layer_slides_along_a_slope_and_is_stopped_by_stairs() -> None:
     assert trial.findings[-1].value > 5.0
 
 
-@pytest.mark.parametrize("error", [0.5, 2.0])
 def test_light_bodies_take_more_iterations_without_the_correction() -> None:
     heavy, light, uncorrected = (
         floating._iterations(12, ratio, corrected=corrected)
@@ -295,6 +294,7 @@ def test_light_bodies_take_more_iterations_without_the_correction() -> None:
     assert uncorrected > 1.5 * heavy
 
 
+@pytest.mark.parametrize("error", [0.5, 2.0])
 def test_a_failed_check_ends_the_process_with_1_after_its_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: float
 ) -> None:
