@@ -310,6 +310,7 @@ class StokesSolve:
         operator.take_equations(kick_dt)
         self._graphs["_launch_start_from_last"].run(velocity, projection.kind, projection.contact)
         if operator.bodies is not None:
+            operator.bodies.take_masses()  # those of the last step have other supports
             operator.bodies.move(self._last_bodies - operator.bodies.velocities)
             moved()
         result = self._iterate(velocity, 0.0, moved, farthest=FARTHEST)

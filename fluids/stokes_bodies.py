@@ -82,13 +82,18 @@ class StokesBodies:
         self._drag.update(level, walls, velocity)
         self._flow.update(walls.kind)
         self._flow.grow_entries()
-        self._m, self._D = self._drag.factors()
+        self.take_masses()
+        self._D = self._drag.drags()
+        self._response = np.linalg.inv(np.eye(self.rank) + self._m @ self._D)
+
+    def take_masses(self) -> None:
+        """Compute the masses of the bodies in their present poses and on their supports."""
+        self._m = self._drag.inverse_masses()
         # Masses without supports: m itself is singular along supported directions, and a
         # pseudo-inverse of it amplifies rounding. For z and r in the range of m,
         # z'm^+ r = z'm0^-1 r with m0 = rho dx^d times the inverse of these masses.
         inverses = [body.free_inverse_mass(self._dimension) for body in self.states]
         self._masses = scipy.linalg.block_diag(*(np.linalg.inv(m) for m in inverses))
-        self._response = np.linalg.inv(np.eye(self.rank) + self._m @ self._D)
         self._energy = self._masses / self._scale
 
     @property

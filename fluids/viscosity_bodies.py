@@ -286,10 +286,14 @@ class BodyDrag:
         """Number of the body of each solid, -1 for the others, int32."""
         return self._pull.owners
 
-    def factors(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return m and D of all bodies, block diagonal, see the class."""
+    def inverse_masses(self) -> np.ndarray:
+        """Return m of all bodies, block diagonal, see the class."""
         m = [self._scale * body.inverse_mass(self.grid.dimension) for body in self.bodies.bodies]
-        return scipy.linalg.block_diag(*m), scipy.linalg.block_diag(*self._drag)
+        return scipy.linalg.block_diag(*m)
+
+    def drags(self) -> np.ndarray:
+        """Return D of all bodies, block diagonal, see the class."""
+        return scipy.linalg.block_diag(*self._drag)
 
     def answer(self, residual: wp.array, change: wp.array) -> None:
         """Add the bodies' response to a change of the liquid's velocity to a residual."""

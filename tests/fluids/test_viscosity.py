@@ -974,5 +974,5 @@ def test_the_drag_of_bodies_that_nearly_touch_is_dissipative() -> None:
             )
         )
         simulation.step(0.005)
-        values = np.linalg.eigvalsh(simulation.viscosity.body_drag.factors()[1])
+        values = np.linalg.eigvalsh(simulation.viscosity.body_drag.drags())
         assert values[0] > -1e-6 * values[-1]
