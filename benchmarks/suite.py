@@ -206,7 +206,7 @@ VALIDATION = Suite(
     "validation",
     "liquids, sand and bodies against known answers, with negative controls: rest, sloshing, "
     "ceiling, dam break, floating, piles and more",
-    "35 minutes",
+    "40 minutes",
     False,
 )
 EXTREMES = Suite(
