@@ -13,12 +13,15 @@ from warp_lcp.operators.grid_poisson import AIR, FLUID, SOLID
 CLOSE = 1e-3  # cells: a face this near to a wall, or behind it, has the wall's velocity
 THETA = 0.02  # cells: the shortest link to a wall
 ALIKE = 1.001  # viscosities within this ratio count as equal
+# Edges of which less is filled have no stress. Two faces of air without mass that only such an edge
+# couples would have a velocity that its weight hardly determines.
+SLIVER = 0.01
 CORE = 1e-3  # relative difference below which diagonals count as equal
 # Change of the distance from face to face [cells] above which the wall is perpendicular to the
 # axis.
 ALONG = 0.95
 KINDS = {"AIR": AIR, "FLUID": FLUID, "SOLID": SOLID, "RELEASED": RELEASED}
-LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE}
+LIMITS = {"CLOSE": CLOSE, "THETA": THETA, "ALONG": ALONG, "ALIKE": ALIKE, "SLIVER": SLIVER}
 KERNELS = KernelFile(Path(__file__).parent / "headers/viscosity.h", KINDS | LIMITS)
 LEVELS = KernelFile(Path(__file__).parent / "headers/viscosity_multigrid.h", {"ALIKE": CORE})
 

@@ -94,7 +94,7 @@ for (int i = first; i < last; ++i) {
 //              thick?, thick_xy?, thick_xz?, thick_yz?; int8 kind, base; uint8 contact; int16
 //              wall_x?, wall_y?, wall_z?
 //   numbers    int planes; float32 scale
-//   constants  AIR, FLUID, SOLID, RELEASED, CLOSE, ALIKE, GHOST, VARIES, BODIES
+//   constants  AIR, FLUID, SOLID, RELEASED, CLOSE, ALIKE, SLIVER, GHOST, VARIES, BODIES
 #include "of_source"
 const int nx = given.cell.shape[2] - 2, ny = given.cell.shape[1] - 2, nz = given.cell.shape[0] - 2;
 const bool deep = planes == 2;
@@ -208,7 +208,8 @@ for (int i = first; i < last; ++i) {
         }
         const float thickness = factor * scale * viscosity(on_edges[e], i);
         const bool free = wall && (released || !held || apart(i, a, b));
-        edge[e][i] = free ? 0.0f : thickness * filled(cells, 4);
+        const float part = filled(cells, 4);
+        edge[e][i] = free || part < (float)SLIVER ? 0.0f : thickness * part;
     }
 }
 
