@@ -6,10 +6,11 @@ u1 minimizes [Batty & Bridson 2008]
    1/2 sum_f V_f |u_f - u1_f|^2 + tau sum_s V_s e_s : e_s,   tau = nu dt / dx^2.
 
 u lies on faces, e_aa at cells, e_ab on edges; differences are in units of 1/dx. V are the liquid
-fractions of the cubes around faces, cells and edges. V = 0 on faces between two cells of air: their
-u1 is extrapolated from the neighbors, and a mass there would hold the surface back by a shear of
-mu d_t u_n in steps of nu dt / dx^2 < 1, with u_n the normal velocity and t along the surface. So
-faces have
+fractions of the cubes around faces, cells and edges. V = 0 on edges with a fraction below 1 %: two
+faces in air that only such an edge couples would have a velocity that it hardly determines. V = 0
+on faces between two cells of air: their u1 is extrapolated from the neighbors, and a mass there
+would hold the surface back by a shear of mu d_t u_n in steps of nu dt / dx^2 < 1, with u_n the
+normal velocity and t along the surface. So faces have
 
    V u + tau K u = V u1,   K symmetric and positive semi-definite,
 

@@ -16,7 +16,7 @@ from default_run import covering, few, slow
 from small_liquids import GRAVITY, advance, box, create, scene
 from viscous_scenes import stirred_scene, viscous_scene
 from warp_lcp.fluids.viscosity import Viscosity
-from warp_lcp.fluids.viscosity_passes import CORE, viscous_passes
+from warp_lcp.fluids.viscosity_passes import CORE, SLIVER, viscous_passes
 from warp_lcp.grid.staggered import StaggeredGrid
 from warp_lcp.operators.grid_poisson import FLUID
 from warp_lcp.problem.result import SolveStatus
@@ -90,7 +90,8 @@ def force_of_energy(simulation, u, tau: float, mixed=None):
         result[a] = result[a] + tau * (below(stress, a) - stress)
         for b in range(a + 1, d):
             mean = 0.25 * (phi + below(phi, a) + below(phi, b) + below(below(phi, a), b))
-            shear = thick(a, b) * filled(mean) * (u[a] - below(u[a], b) + u[b] - below(u[b], a))
+            part = np.where(filled(mean) < SLIVER, 0.0, filled(mean))
+            shear = thick(a, b) * part * (u[a] - below(u[a], b) + u[b] - below(u[b], a))
             result[a] = result[a] + tau * (shear - above(shear, b))
             result[b] = result[b] + tau * (shear - above(shear, a))
     return result, volume
