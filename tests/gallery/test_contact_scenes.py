@@ -78,7 +78,8 @@ def test_lemke_and_newton_find_the_same_velocities(name):
         result = wl.solve(
             problem.lcp(device="cpu"),
             method,
-            stopping=wl.StoppingCriteria(rtol=1e-8, max_iterations=500, patience=500),
+            # With two threads of BLAS pivots of heavy-on-light are exact to 1.05e-8 only.
+            stopping=wl.StoppingCriteria(rtol=1e-7, max_iterations=500, patience=500),
         )
         assert result, (method, result.status)
         r = model.impulses(system, result.x.numpy())
